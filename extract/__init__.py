@@ -1,0 +1,1 @@
+"""Exact extraction: traversal of the IR, welding, meshes."""

@@ -1,0 +1,1 @@
+"""The canonical piecewise-linear IR of mn-onnx."""

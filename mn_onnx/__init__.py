@@ -1,0 +1,1 @@
+"""mn-onnx: exact level sets of networks exported to ONNX."""
