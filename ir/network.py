@@ -7,7 +7,7 @@ A network is a DAG of scalar *units*. Unit ``g`` has an affine *pre-activation*
 over *variables* ``v``: the ``input_dim`` coordinates first, then the outputs of earlier units in order. The unit maps
 ``t_g`` through one scalar function per output. The network's value is one more affine row.
 
-At the *imported* stage a scalar function may be a smooth `Curve`; at the *canonical* stage every unit carries a `table`
+At the *imported* stage a scalar function may be a smooth `Expression`; at the *canonical* stage every unit carries a `table`
 (merged knots; one slope and intercept per output and interval).
 """
 
@@ -19,6 +19,8 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
+
+from mn_onnx.ir.expression import Expression
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -51,7 +53,9 @@ class KnotTable:
     errors: Floats
 
     @classmethod
-    def exact(cls, knots: Sequence[float], slopes: Sequence[Sequence[float]], intercepts: Sequence[Sequence[float]]) -> KnotTable:
+    def exact(
+        cls, knots: Sequence[float], slopes: Sequence[Sequence[float]], intercepts: Sequence[Sequence[float]]
+    ) -> KnotTable:
         """A table without error from plain sequences."""
         slope_array = np.atleast_2d(np.asarray(slopes, np.float64))
         return cls(
@@ -71,23 +75,7 @@ class KnotTable:
         return self.slopes[:, interval] * t + self.intercepts[:, interval]
 
 
-@dataclass(frozen=True)
-class Curve:
-    """A smooth scalar function ``outer_scale * kind(inner_scale * t + inner_shift) + outer_shift``.
-
-    ``kind`` names an entry of `mn_onnx.ir.surrogate.curves` (``"sin"``, ``"softplus"``, ...); ``parameters`` are that
-    entry's own constants (for example the alpha of ELU).
-    """
-
-    kind: str
-    parameters: tuple[float, ...] = ()
-    inner_scale: float = 1.0
-    inner_shift: float = 0.0
-    outer_scale: float = 1.0
-    outer_shift: float = 0.0
-
-
-ScalarFunction = KnotTable | Curve
+ScalarFunction = KnotTable | Expression
 
 
 @dataclass(frozen=True, eq=False)
