@@ -1,0 +1,47 @@
+"""The exceptions that users meet, and the problems that a refusal lists."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+
+class MnOnnxError(Exception):
+    """Base of all errors that mn-onnx raises on purpose."""
+
+
+class UsageError(MnOnnxError):
+    """An argument, option or path is wrong."""
+
+
+class CheckFailed(MnOnnxError):
+    """A result contradicts its checks: parity with onnxruntime, or the invariants of the mesh."""
+
+
+@dataclass(frozen=True)
+class Problem:
+    """One reason why a model is refused.
+
+    ``node``: name of the ONNX node, tensor or input concerned (empty: the whole model); ``op``: its operator, with the
+    domain unless it is the standard one (empty if ``node`` is not a node); ``opset``: the version of that domain that
+    the model imports (0 if unknown); ``reason``: what was found and what is supported; ``remedy``: what the user can do.
+    """
+
+    node: str
+    op: str
+    opset: int
+    reason: str
+    remedy: str = ""
+
+    def __str__(self) -> str:
+        detail = f" ({self.op}, opset {self.opset})" if self.op and self.opset else f" ({self.op})" if self.op else ""
+        subject = (self.node or "model") + detail
+        return f"{subject}: {self.reason}" + (f"\n  Fix: {self.remedy}" if self.remedy else "")
+
+
+class ModelRefused(MnOnnxError):
+    """The model cannot be imported; ``problems`` lists every reason, in graph order."""
+
+    def __init__(self, problems: Sequence[Problem]) -> None:
+        self.problems = list(problems)
+        super().__init__("\n".join(str(problem) for problem in self.problems))
