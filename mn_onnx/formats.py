@@ -18,7 +18,11 @@ _EXPORT = "export the network to ONNX (torch.onnx.export, tf2onnx, jax2onnx, skl
 
 # Files that people pass instead of a model: leading bytes, what the file is, what to do.
 _OTHER_FILES: tuple[tuple[bytes, str, str], ...] = (
-    (b"version https://git-lfs", "a Git LFS pointer, not the model itself", "run `git lfs pull` where the file is from"),
+    (
+        b"version https://git-lfs",
+        "a Git LFS pointer, not the model itself",
+        "run `git lfs pull` where the file is from",
+    ),
     (b"PK\x03\x04", "a zip archive, as PyTorch checkpoints (.pt, .pth), Keras files and .npz are", _EXPORT),
     (b"\x89HDF", "an HDF5 file, as Keras weights are", _EXPORT),
     (b"\x80\x02", "a Python pickle, as old PyTorch checkpoints are", _EXPORT),
@@ -94,7 +98,9 @@ def _decode_text(text: str, name: str) -> onnx.ModelProto:
 
 def _decode_binary(data: bytes, name: str) -> onnx.ModelProto:
     if len(data) > PROTOBUF_LIMIT:
-        raise _refused(name, "the file has more than 2 GiB, the limit of protobuf", "store the weights as external data")
+        raise _refused(
+            name, "the file has more than 2 GiB, the limit of protobuf", "store the weights as external data"
+        )
     try:
         return onnx.ModelProto.FromString(data)
     except DecodeError as error:

@@ -38,7 +38,9 @@ def opset_problems(model: onnx.ModelProto) -> list[Problem]:
         problems.append(Problem("", "", 0, reason, "export with an older opset_version, or update mn-onnx"))
     counts = Counter("" if entry.domain == "ai.onnx" else entry.domain for entry in model.opset_import)
     for domain in sorted(domain for domain, count in counts.items() if count > 1):
-        found = sorted({entry.version for entry in model.opset_import if entry.domain.removeprefix("ai.onnx") == domain})
+        found = sorted(
+            {entry.version for entry in model.opset_import if entry.domain.removeprefix("ai.onnx") == domain}
+        )
         if len(found) > 1:
             reason = f"the operator set {domain or 'ai.onnx'!r} is imported in several versions: {found}"
             problems.append(Problem("", "", 0, reason, _EXPORT_AGAIN))

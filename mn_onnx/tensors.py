@@ -14,7 +14,9 @@ from onnx import external_data_helper, numpy_helper
 from mn_onnx.errors import Problem
 from mn_onnx.formats import PROTOBUF_LIMIT
 
-_STORE_ANEW = "export the model again, or store its weights inside the file (onnx.save with save_as_external_data=False)"
+_STORE_ANEW = (
+    "export the model again, or store its weights inside the file (onnx.save with save_as_external_data=False)"
+)
 
 
 @dataclass(frozen=True)
@@ -74,7 +76,9 @@ def embed_external_data(model: onnx.ModelProto, folder: Path | None) -> tuple[li
             external_data_helper.load_external_data_for_tensor(tensor, str(folder))
         except (ValueError, OSError, onnx.checker.ValidationError) as error:
             reason = f"its data in the external file {location!r} cannot be read: {error}"
-            problems.append(Problem(stored.owner, "", 0, reason, "copy the file again from where the model was exported"))
+            problems.append(
+                Problem(stored.owner, "", 0, reason, "copy the file again from where the model was exported")
+            )
             continue
         # Older versions of the helper leave these marks, and later readers would look for the file again.
         tensor.data_location = onnx.TensorProto.DEFAULT
