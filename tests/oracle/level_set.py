@@ -1,7 +1,8 @@
 """The exact level set ``f = 0`` of a tiny network: one facet per activation region that it cuts, and their topology.
 
-A facet belongs to the boundary of ``{f < 0}``: where ``f`` vanishes on a whole facet of a region, the region counts
-only if ``f`` is negative inside. The facets therefore always close up, away from the box faces, in degenerate cases too.
+A facet belongs to the boundary of ``{f < 0}`` in the open box: where ``f`` vanishes on a whole facet of a region, the
+region counts only if ``f`` is negative inside. The facets therefore always close up, away from the box faces, in
+degenerate cases too.
 """
 
 from __future__ import annotations
@@ -10,12 +11,13 @@ from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
-from functools import cached_property
+from functools import cached_property, reduce
 from math import sqrt
+from operator import and_
 
 from mn_onnx.ir.network import Network
 from oracle.polytope import Affine, Point, area_vector, dot, ordered_polygon, subtract
-from oracle.regions import Region, activation_regions
+from oracle.regions import activation_regions
 
 
 @dataclass(frozen=True)
@@ -131,6 +133,7 @@ def exact_level_set(network: Network, lower: Sequence[float], upper: Sequence[fl
     """The level set of ``network`` in the box ``lower`` to ``upper``, by enumeration of all regions without pruning."""
     facets: list[Facet] = []
     flat_regions: list[tuple[int, ...]] = []
+    box_planes = (1 << 2 * len(lower)) - 1
     n_regions = 0
     inner_volume = Fraction(0)
     for region in activation_regions(network, lower, upper):
@@ -143,7 +146,11 @@ def exact_level_set(network: Network, lower: Sequence[float], upper: Sequence[fl
             continue
         if len(lower) == 3:
             inner_volume += inner.volume()
-        facets += _facets(region)
+        cut = region.polytope.section(region.value)
+        in_box_face = reduce(and_, (vertex.tight for vertex in cut), box_planes)
+        if len(cut) >= len(lower) and not in_box_face:
+            points = [vertex.position for vertex in cut]
+            facets.append(Facet(region.states, _oriented(points, region.value), region.value.normal))
     return LevelSet(
         tuple(Fraction(low) for low in lower),
         tuple(Fraction(high) for high in upper),
@@ -154,18 +161,10 @@ def exact_level_set(network: Network, lower: Sequence[float], upper: Sequence[fl
     )
 
 
-def _facets(region: Region) -> list[Facet]:
-    points = [vertex.position for vertex in region.polytope.section(region.value)]
-    dimension = region.polytope.dimension
-    if len(points) < dimension:
-        return []
-    return [Facet(region.states, _oriented(points, region.value, dimension), region.value.normal)]
-
-
-def _oriented(points: list[Point], value: Affine, dimension: int) -> tuple[Point, ...]:
-    if dimension == 3:
+def _oriented(points: list[Point], value: Affine) -> tuple[Point, ...]:
+    if len(value.normal) == 3:
         return ordered_polygon(points, value.normal)
-    if dimension == 2:
+    if len(value.normal) == 2:
         first, second = sorted(points)
         along = subtract(second, first)
         left = (-along[1], along[0])

@@ -1,0 +1,26 @@
+"""Analytic level sets, many in degenerate position: the oracle finds what was computed by hand."""
+
+from __future__ import annotations
+
+import pytest
+
+from oracle.corpus import CORPUS, Case
+from oracle.level_set import exact_level_set
+from oracle.sketch import as_network
+
+
+@pytest.mark.parametrize("case", CORPUS, ids=str)
+def test_oracle_agrees_with_the_table(case: Case) -> None:
+    exact = exact_level_set(as_network(case.body), *case.bounds)
+    assert float(exact.inner_volume) == pytest.approx(case.volume, abs=1e-12)
+    assert exact.area == pytest.approx(case.area, abs=1e-12)
+    assert exact.euler == case.euler
+    assert len(exact.components) == case.components
+    assert bool(exact.flat_regions) == case.has_flat_regions
+    rims = [exact.box_faces(edge) for edge in exact.boundary_edges]
+    assert all(rims)
+    assert {face for faces in rims for face in faces} == case.open_faces
+    if not case.open_faces:
+        assert exact.enclosed_volume == (exact.inner_volume if exact.facets else 0)
+    if case.counts:
+        assert (len(exact.facets), len(exact.vertices), exact.n_edges) == case.counts
