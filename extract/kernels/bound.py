@@ -1,0 +1,222 @@
+"""Bounds of every unit and of the output over a cell, and the states that follow from them.
+
+Each pre-activation is enclosed by a linear centre and a radius, ``|t - c(x)| <= r``, evaluated at the cell's own vertices
+(a linear function is extreme there). A unit of several pieces is relaxed by its chord over the range of ``t``. The
+output is bounded by a backward pass over the same chords, as in CROWN (Zhang et al., NeurIPS 2018).
+"""
+
+from __future__ import annotations
+
+from numba import njit
+
+from mn_onnx.extract.kernels.lanes import add, fma, lane, larger, load, magnitude, multiply, smaller, splat, store
+from mn_onnx.extract.kernels.memory import (
+    CELL_CAPACITY,
+    CELL_FLOATS,
+    CELL_VERTICES,
+    CENTRE_AT,
+    ERROR,
+    HIGH,
+    LOW,
+    OFFSET,
+    OUT_COEF,
+    RADIUS,
+    SLOPE,
+    STATE_HIGH,
+    STATE_LOW,
+    SYS_COLS,
+    SYS_HEADER,
+    SYS_LEVELS,
+    SYS_ROWS,
+    padded,
+)
+
+# Rounding of a bound, relative to the magnitude of what was summed: 2^-40 is about 4000 units in the last place.
+MARGIN = 2.0**-40
+
+
+@njit(cache=True)
+def row_extremes(F, I, X, M, cell, begin, end):
+    """LOW and HIGH of rows ``begin:end`` (multiples of the lane width) over the cell's vertices."""
+    n = I[cell + CELL_VERTICES]
+    x = I[cell + CELL_FLOATS]
+    capacity = I[cell + CELL_CAPACITY]
+    y, z = x + capacity, x + 2 * capacity
+    for r in range(begin, end, 4):
+        c0, c1, c2, c3 = load(X, r), load(X, M + r), load(X, 2 * M + r), load(X, 3 * M + r)
+        low = fma(c0, splat(F[x]), fma(c1, splat(F[y]), fma(c2, splat(F[z]), c3)))
+        high = low
+        for v in range(1, n):
+            value = fma(c0, splat(F[x + v]), fma(c1, splat(F[y + v]), fma(c2, splat(F[z + v]), c3)))
+            low = smaller(value, low)
+            high = larger(value, high)
+        store(X, LOW * M + r, low)
+        store(X, HIGH * M + r, high)
+
+
+@njit(cache=True)
+def relax_piece_range(knots, slopes, intercepts, knot, piece, first, last, low, high):
+    """Chord over [low, high] of a table's pieces ``first..last``: slope, offset, error with |y - slope t - offset| <= error."""
+    if first == last:
+        return slopes[piece + first], intercepts[piece + first], 0.0
+    at_low = slopes[piece + first] * low + intercepts[piece + first]
+    at_high = slopes[piece + last] * high + intercepts[piece + last]
+    slope = (at_high - at_low) / (high - low)
+    above, below = 0.0, 0.0
+    for s in range(first, last):
+        kappa = knots[knot + s]
+        deviation = slopes[piece + s] * kappa + intercepts[piece + s] - (at_low + slope * (kappa - low))
+        above = max(above, deviation)
+        below = min(below, deviation)
+    return slope, at_low - slope * low + 0.5 * (above + below), 0.5 * (above - below)
+
+
+@njit(cache=True)
+def settle_row(I, X, J, M, tables, cols, r, unit):
+    """Tighten the state range of row ``r`` by its bounds and relax its outputs.
+
+    Sets STATE_LOW, STATE_HIGH of the row and SLOPE, OFFSET, ERROR of its columns.
+    """
+    knot, knots = tables.first_knot[unit], tables.knots
+    first, last = J[STATE_LOW * M + r], J[STATE_HIGH * M + r]
+    radius = X[RADIUS * M + r]
+    low, high = X[LOW * M + r], X[HIGH * M + r]
+    margin = 0.0
+    if radius > 0.0:
+        low -= radius
+        high += radius
+        size = abs(X[r]) + abs(X[M + r]) + abs(X[2 * M + r]) + abs(X[3 * M + r]) + radius
+        margin = MARGIN * size * tables.extent
+    while first < last and low - margin >= knots[knot + first]:
+        first += 1
+    while last > first and high + margin < knots[knot + last - 1]:
+        last -= 1
+    if first < last:
+        # A cell that was split here lies on one side of the knot, whatever the radius says.
+        if first > 0 and low < knots[knot + first - 1] < high:
+            low = knots[knot + first - 1]
+        if last < tables.first_knot[unit + 1] - knot and low < knots[knot + last] < high:
+            high = knots[knot + last]
+    J[STATE_LOW * M + r] = first
+    J[STATE_HIGH * M + r] = last
+    X[LOW * M + r] = low
+    X[HIGH * M + r] = high
+    begin, end = I[cols + r], I[cols + r + 1]
+    pieces = tables.first_knot[unit + 1] - knot + 1
+    piece = tables.first_piece[unit]
+    for c in range(begin, end):
+        slope, offset, error = relax_piece_range(
+            knots, tables.slopes, tables.intercepts, knot, piece, first, last, low, high
+        )
+        X[SLOPE * M + c] = slope
+        X[OFFSET * M + c] = offset
+        X[ERROR * M + c] = error
+        piece += pieces
+
+
+@njit(cache=True)
+def push_column(F, X, M, weights, begin, end, r, slope, offset, error):
+    """Add a column's relaxed output to the centres and radii of the later rows ``begin:end``."""
+    y0, y1, y2 = splat(slope * X[r]), splat(slope * X[M + r]), splat(slope * X[2 * M + r])
+    y3 = splat(slope * X[3 * M + r] + offset)
+    width = splat(abs(slope) * X[RADIUS * M + r] + error)
+    for q in range(begin, end, 4):
+        w = load(F, weights + q)
+        store(X, q, fma(w, y0, load(X, q)))
+        store(X, M + q, fma(w, y1, load(X, M + q)))
+        store(X, 2 * M + q, fma(w, y2, load(X, 2 * M + q)))
+        store(X, 3 * M + q, fma(w, y3, load(X, 3 * M + q)))
+        store(X, RADIUS * M + q, fma(magnitude(w), width, load(X, RADIUS * M + q)))
+
+
+@njit(cache=True)
+def bound_units(F, I, X, J, M, tables, cell, system, floats):
+    """Forward pass: bounds, states and relaxations of all rows of the system over the cell.
+
+    Reads the row states in J (STATE_LOW, STATE_HIGH) and narrows them. Returns the number of unstable rows.
+    """
+    rows, cols, levels = I[system + SYS_ROWS], I[system + SYS_COLS], I[system + SYS_LEVELS]
+    level_start = system + SYS_HEADER
+    row_unit = level_start + levels + 1
+    row_col = row_unit + rows
+    col_begin = row_col + rows + 1 + cols
+    col_end = col_begin + cols
+    zero = splat(0.0)
+    for r in range(0, rows, 4):
+        store(X, r, load(F, floats + r))
+        store(X, M + r, load(F, floats + rows + r))
+        store(X, 2 * M + r, load(F, floats + 2 * rows + r))
+        store(X, 3 * M + r, load(F, floats + 3 * rows + r))
+        store(X, RADIUS * M + r, zero)
+    unstable = 0
+    for level in range(levels):
+        begin, end = I[level_start + level], I[level_start + level + 1]
+        row_extremes(F, I, X, M, cell, begin, end)
+        for r in range(begin, end):
+            unit = I[row_unit + r]
+            if unit < 0:
+                continue
+            settle_row(I, X, J, M, tables, row_col, r, unit)
+            if J[STATE_LOW * M + r] < J[STATE_HIGH * M + r]:
+                unstable += 1
+            for c in range(I[row_col + r], I[row_col + r + 1]):
+                slope, offset, error = X[SLOPE * M + c], X[OFFSET * M + c], X[ERROR * M + c]
+                if slope != 0.0 or offset != 0.0 or error != 0.0:
+                    weights = floats + 4 * rows + c * rows
+                    push_column(F, X, M, weights, I[col_begin + c], I[col_end + c], r, slope, offset, error)
+    return unstable
+
+
+@njit(cache=True)
+def bound_output(F, I, X, M, system, floats):
+    """Backward pass: the output's linear centre (X[CENTRE_AT], four numbers) and its radius, which is returned."""
+    rows, cols = I[system + SYS_ROWS], I[system + SYS_COLS]
+    row_col = system + SYS_HEADER + I[system + SYS_LEVELS] + 1 + rows
+    col_row = row_col + rows + 1
+    col_begin = col_row + cols
+    col_end = col_begin + cols
+    weights = floats + 4 * rows
+    out_weights = weights + cols * rows
+    multiplier = OUT_COEF * M  # d output / d pre-activation, per row, along the chords
+    zero = splat(0.0)
+    for r in range(0, rows, 4):
+        store(X, multiplier + r, zero)
+    radius, constant = 0.0, 0.0
+    for c in range(cols - 1, -1, -1):
+        begin, end = I[col_begin + c], I[col_end + c]
+        total = zero
+        for q in range(begin, end, 4):
+            total = fma(load(X, multiplier + q), load(F, weights + c * rows + q), total)
+        coefficient = F[out_weights + c] + ((lane(total, 0) + lane(total, 1)) + (lane(total, 2) + lane(total, 3)))
+        X[multiplier + I[col_row + c]] += coefficient * X[SLOPE * M + c]
+        constant += coefficient * X[OFFSET * M + c]
+        radius += abs(coefficient) * X[ERROR * M + c]
+    s0, s1, s2, s3 = zero, zero, zero, zero
+    for r in range(0, rows, 4):
+        m = load(X, multiplier + r)
+        s0 = fma(m, load(F, floats + r), s0)
+        s1 = fma(m, load(F, floats + rows + r), s1)
+        s2 = fma(m, load(F, floats + 2 * rows + r), s2)
+        s3 = fma(m, load(F, floats + 3 * rows + r), s3)
+    out = out_weights + padded(cols)
+    at = CENTRE_AT * M
+    X[at] = F[out] + ((lane(s0, 0) + lane(s0, 1)) + (lane(s0, 2) + lane(s0, 3)))
+    X[at + 1] = F[out + 1] + ((lane(s1, 0) + lane(s1, 1)) + (lane(s1, 2) + lane(s1, 3)))
+    X[at + 2] = F[out + 2] + ((lane(s2, 0) + lane(s2, 1)) + (lane(s2, 2) + lane(s2, 3)))
+    X[at + 3] = F[out + 3] + constant + ((lane(s3, 0) + lane(s3, 1)) + (lane(s3, 2) + lane(s3, 3)))
+    return radius
+
+
+@njit(cache=True)
+def value_range(X, M, region, count):
+    """Smallest and largest of the first ``count`` (a multiple of the lane width) values of a region."""
+    low = load(X, region * M)
+    high = low
+    for v in range(4, count, 4):
+        value = load(X, region * M + v)
+        low = smaller(value, low)
+        high = larger(value, high)
+    return (
+        min(min(lane(low, 0), lane(low, 1)), min(lane(low, 2), lane(low, 3))),
+        max(max(lane(high, 0), lane(high, 1)), max(lane(high, 2), lane(high, 3))),
+    )

@@ -1,0 +1,201 @@
+"""Small cells: every linear piece of the surface in a cell with few unstable units, without splitting the cell.
+
+The states of the remaining units are enumerated in topological order. Under each choice every pre-activation and the
+output are affine, so the piece is the polygon in which f = 0 cuts the cell, clipped by the knots of the units that have
+more than one possible state. Cutting a polygon is several times cheaper than splitting a polytope.
+"""
+
+from __future__ import annotations
+
+from numba import njit
+
+from mn_onnx.extract.kernels.bound import value_range
+from mn_onnx.extract.kernels.memory import (
+    CELL_CAPACITY,
+    CHOICE,
+    CHOICE_FIRST,
+    CHOICE_LAST,
+    FORMS,
+    OUT_VALUES,
+    POLY_A,
+    POLY_B,
+    STATE_HIGH,
+    STATE_LOW,
+    SYS_COLS,
+    SYS_HASH,
+    SYS_HEADER,
+    SYS_LEVELS,
+    SYS_ROWS,
+    TAGS_A,
+    TAGS_B,
+    VALUES,
+    padded,
+)
+from mn_onnx.extract.kernels.polytope import (
+    clip_polygon,
+    evaluate_affine,
+    find_cut_edges,
+    link_cut_edges,
+    read_cut_polygon,
+)
+
+
+@njit(cache=True)
+def emit_polygon(X, J, M, output, tables, count, polygon, tags, hash0, hash1, gradient):
+    """Append a polygon to the output buffers; the caller has made sure that they have room."""
+    corner = output.counts[1]
+    for j in range(count):
+        before = J[tags * M + (j - 1 if j > 0 else count - 1)]
+        after = J[tags * M + j]
+        for axis in range(3):
+            output.positions[corner + j, axis] = X[(polygon + axis) * M + j]
+        output.keys[corner + j, 0] = hash0 ^ tables.tag_hash[before, 0] ^ tables.tag_hash[after, 0]
+        output.keys[corner + j, 1] = hash1 ^ tables.tag_hash[before, 1] ^ tables.tag_hash[after, 1]
+        output.box_faces[corner + j] = (after >> 1) - tables.n_knots if after >= 2 * tables.n_knots else -1
+    face = output.counts[0]
+    output.sizes[face] = count
+    for axis in range(3):
+        output.gradients[face, axis] = X[gradient + axis]
+    output.counts[0] = face + 1
+    output.counts[1] = corner + count
+
+
+@njit(cache=True)
+def substitute_row(F, I, X, J, M, system, floats, tables, r, target):
+    """Affine form of row ``r`` at ``X[target : target + 4]`` under the states chosen for the rows before it."""
+    rows = I[system + SYS_ROWS]
+    row_unit = system + SYS_HEADER + I[system + SYS_LEVELS] + 1
+    row_col = row_unit + rows
+    c0, c1, c2, c3 = F[floats + r], F[floats + rows + r], F[floats + 2 * rows + r], F[floats + 3 * rows + r]
+    for q in range(r):
+        for c in range(I[row_col + q], I[row_col + q + 1]):
+            w = F[floats + 4 * rows + c * rows + r]
+            if w != 0.0:
+                unit = I[row_unit + q]
+                pieces = tables.first_knot[unit + 1] - tables.first_knot[unit] + 1
+                piece = tables.first_piece[unit] + (c - I[row_col + q]) * pieces + J[CHOICE * M + q]
+                slope = w * tables.slopes[piece]
+                at = FORMS * M + 4 * q
+                c0 += slope * X[at]
+                c1 += slope * X[at + 1]
+                c2 += slope * X[at + 2]
+                c3 += slope * X[at + 3] + w * tables.intercepts[piece]
+    X[target], X[target + 1], X[target + 2], X[target + 3] = c0, c1, c2, c3
+
+
+@njit(cache=True)
+def substitute_output(F, I, X, J, M, system, floats, tables, target):
+    """Affine form of the output at ``X[target : target + 4]`` under the chosen states of all rows."""
+    rows, cols = I[system + SYS_ROWS], I[system + SYS_COLS]
+    row_unit = system + SYS_HEADER + I[system + SYS_LEVELS] + 1
+    row_col = row_unit + rows
+    out_weights = floats + 4 * rows + cols * rows
+    out = out_weights + padded(cols)
+    c0, c1, c2, c3 = F[out], F[out + 1], F[out + 2], F[out + 3]
+    for q in range(rows):
+        for c in range(I[row_col + q], I[row_col + q + 1]):
+            w = F[out_weights + c]
+            unit = I[row_unit + q]
+            pieces = tables.first_knot[unit + 1] - tables.first_knot[unit] + 1
+            piece = tables.first_piece[unit] + (c - I[row_col + q]) * pieces + J[CHOICE * M + q]
+            slope = w * tables.slopes[piece]
+            at = FORMS * M + 4 * q
+            c0 += slope * X[at]
+            c1 += slope * X[at + 1]
+            c2 += slope * X[at + 2]
+            c3 += slope * X[at + 3] + w * tables.intercepts[piece]
+    X[target], X[target + 1], X[target + 2], X[target + 3] = c0, c1, c2, c3
+
+
+@njit(cache=True)
+def emit_choice(F, I, X, J, M, output, tables, slot_of_tag, cell, cell_rows, system, floats):
+    """Emit the polygon of the chosen states, if the surface has one there. Returns 1 if it does, else 0."""
+    rows = I[system + SYS_ROWS]
+    row_unit = system + SYS_HEADER + I[system + SYS_LEVELS] + 1
+    gradient = FORMS * M + 4 * rows
+    substitute_output(F, I, X, J, M, system, floats, tables, gradient)
+    evaluate_affine(
+        F, I, X, M, cell, OUT_VALUES, X[gradient], X[gradient + 1], X[gradient + 2], X[gradient + 3]
+    )
+    low, high = value_range(X, M, OUT_VALUES, I[cell + CELL_CAPACITY])
+    if low >= 0.0 or high < 0.0:
+        return 0
+    count = find_cut_edges(F, I, X, J, M, cell, cell_rows, OUT_VALUES)
+    link_cut_edges(J, M, slot_of_tag, count)
+    polygon, tags, other, other_tags = POLY_A, TAGS_A, POLY_B, TAGS_B
+    read_cut_polygon(X, J, M, count, polygon, tags)
+    hash0, hash1 = I[system + SYS_HASH], I[system + SYS_HASH + 1]
+    for r in range(rows):
+        unit = I[row_unit + r]
+        if unit < 0:
+            continue
+        knot = tables.first_knot[unit]
+        state = J[CHOICE * M + r]
+        hash0 ^= tables.state_hash[knot + unit + state, 0]
+        hash1 ^= tables.state_hash[knot + unit + state, 1]
+        at = FORMS * M + 4 * r
+        for side in range(2):
+            # side 1: the state's lower knot, to its right; side 0: its upper knot, to its left.
+            if state == (J[CHOICE_FIRST * M + r] if side == 1 else J[CHOICE_LAST * M + r]):
+                continue
+            plane = knot + state - side
+            constant = X[at + 3] - tables.knots[plane]
+            count = clip_polygon(
+                X, J, M, count, polygon, tags, other, other_tags,
+                X[at], X[at + 1], X[at + 2], constant, side, 2 * plane + side,
+            )  # fmt: skip
+            if count == 0:
+                return 0
+            polygon, tags, other, other_tags = other, other_tags, polygon, tags
+    emit_polygon(X, J, M, output, tables, count, polygon, tags, hash0, hash1, gradient)
+    return 1
+
+
+@njit(cache=True)
+def open_choice(F, I, X, J, M, tables, cell, system, floats, r):
+    """Find the states that row ``r`` can take in the cell, given those chosen before, and choose the first."""
+    unit = I[system + SYS_HEADER + I[system + SYS_LEVELS] + 1 + r]
+    if unit < 0:
+        J[CHOICE * M + r] = 0
+        J[CHOICE_LAST * M + r] = 0
+        return
+    at = FORMS * M + 4 * r
+    substitute_row(F, I, X, J, M, system, floats, tables, r, at)
+    evaluate_affine(F, I, X, M, cell, VALUES, X[at], X[at + 1], X[at + 2], X[at + 3])
+    low, high = value_range(X, M, VALUES, I[cell + CELL_CAPACITY])
+    first, last = J[STATE_LOW * M + r], J[STATE_HIGH * M + r]
+    knot = tables.first_knot[unit]
+    while first < last and low >= tables.knots[knot + first]:
+        first += 1
+    while last > first and high < tables.knots[knot + last - 1]:
+        last -= 1
+    J[CHOICE_FIRST * M + r] = first
+    J[CHOICE_LAST * M + r] = last
+    J[CHOICE * M + r] = first
+
+
+@njit(cache=True)
+def emit_leaf(F, I, X, J, M, output, tables, slot_of_tag, cell, cell_rows, system, floats):
+    """Enumerate the states of a small folded system over a cell and emit every polygon; returns their number.
+
+    The cell's own state rows belong to another system (``cell_rows`` of them); the states of this system's rows are
+    J[STATE_LOW], J[STATE_HIGH].
+    """
+    rows = I[system + SYS_ROWS]
+    emitted = 0
+    r = 0
+    opening = True
+    while True:
+        if opening:
+            while r < rows:
+                open_choice(F, I, X, J, M, tables, cell, system, floats, r)
+                r += 1
+            emitted += emit_choice(F, I, X, J, M, output, tables, slot_of_tag, cell, cell_rows, system, floats)
+            opening = False
+        r -= 1
+        if r < 0:
+            return emitted
+        if J[CHOICE * M + r] < J[CHOICE_LAST * M + r]:
+            J[CHOICE * M + r] += 1
+            r += 1
+            opening = True

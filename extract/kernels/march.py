@@ -1,0 +1,259 @@
+"""Branch and fold: the depth-first traversal of one worker, resumable after any cell.
+
+A cell is bounded, dropped if the output cannot reach the level there, folded when enough of its units have settled, and
+split along a knot of a unit whose pre-activation is already affine on it; small cells are emitted whole (`leaf`).
+`march` returns to its caller, with the worker's state intact, when a budget of work is used up, when an arena or an
+output buffer might not have room for the next cell, or when it is told to stop.
+"""
+
+from __future__ import annotations
+
+from numba import njit
+
+from mn_onnx.extract.kernels.bound import MARGIN, bound_output, bound_units, value_range
+from mn_onnx.extract.kernels.fold import carry_states, fold, folding_floats
+from mn_onnx.extract.kernels.leaf import emit_leaf
+from mn_onnx.extract.kernels.memory import (
+    CELL_CAPACITY,
+    CELL_DEPTH,
+    CELL_END_F,
+    CELL_END_I,
+    CELL_HEADER,
+    CELL_SYSTEM_F,
+    CELL_SYSTEM_I,
+    CELL_VERTICES,
+    CENTRE_AT,
+    CUT_FROM,
+    CUT_TO,
+    HIGH,
+    LOW,
+    NEW_INDEX,
+    OUT_VALUES,
+    RADIUS,
+    STATE_HIGH,
+    STATE_LOW,
+    SYS_COLS,
+    SYS_FLOATS,
+    SYS_HEADER,
+    SYS_INTS,
+    SYS_LEVELS,
+    SYS_ROWS,
+    SYS_UNITS,
+    VALUES,
+    X_REGIONS,
+    cell_ints,
+    padded,
+    system_ints,
+)
+from mn_onnx.extract.kernels.polytope import evaluate_affine, find_cut_edges, link_cut_edges, write_half
+
+DONE, BUDGET_USED, ARENA_FULL, SCRATCH_FULL, OUTPUT_FULL, STACK_FULL, STOPPED = 0, 1, 2, 3, 4, 5, 6
+
+# Entries of the control array.
+(STACK_BOTTOM, STACK_TOP, TOP_F, TOP_I, STOP, LEAF_CHOICES, NODES, PRUNED, LEAVES, FOLDS, WORK, NEED_F, NEED_I) = range(13)
+(CONSTANT_CELLS, DEEPEST, NEED_CORNERS, NEED_POLYGONS, CHILDREN_PRUNED, CONTROL_SIZE) = range(13, 19)
+
+
+@njit(cache=True)
+def missing_room(F, I, M, control, stack, output, cell, rows, cols, levels):
+    """The status to return if the next cell might not fit anywhere, else DONE; sets the NEED_* entries."""
+    vertices = I[cell + CELL_VERTICES]
+    most = 2 * vertices + 8
+    choices = control[LEAF_CHOICES]
+    need_f = control[TOP_F] + folding_floats(rows, cols) + 6 * padded(most)
+    need_i = control[TOP_I] + system_ints(rows, cols, levels) + 2 * cell_ints(rows, most)
+    if need_f > F.size or need_i > I.size:
+        control[NEED_F], control[NEED_I] = need_f, need_i
+        return ARENA_FULL
+    if most + 2 * choices > M:
+        control[NEED_I] = most + 2 * choices
+        return SCRATCH_FULL
+    if control[STACK_TOP] + 2 > stack.size:
+        return STACK_FULL
+    polygons, corners = choices, choices * (vertices + 2 * choices + 8)
+    if output.counts[0] + polygons > output.sizes.size or output.counts[1] + corners > output.keys.shape[0]:
+        control[NEED_POLYGONS], control[NEED_CORNERS] = polygons, corners
+        return OUTPUT_FULL
+    return DONE
+
+
+@njit(cache=True)
+def count_choices(I, J, M, system, most):
+    """Product of the numbers of states the rows still have, or anything above ``most``."""
+    row_unit = system + SYS_HEADER + I[system + SYS_LEVELS] + 1
+    product = 1
+    for r in range(I[system + SYS_ROWS]):
+        if I[row_unit + r] >= 0:
+            product *= J[STATE_HIGH * M + r] - J[STATE_LOW * M + r] + 1
+            if product > most:
+                return product
+    return product
+
+
+@njit(cache=True)
+def choose_split(I, X, J, M, tables, system):
+    """Row and knot to split at: of the unstable rows that are affine on the cell, the most evenly divided one."""
+    row_unit = system + SYS_HEADER + I[system + SYS_LEVELS] + 1
+    best, best_row, best_knot = -1.0, -1, 0
+    for r in range(I[system + SYS_ROWS]):
+        first, last = J[STATE_LOW * M + r], J[STATE_HIGH * M + r]
+        if I[row_unit + r] < 0 or first == last or X[RADIUS * M + r] > 0.0:
+            continue
+        low, high = X[LOW * M + r], X[HIGH * M + r]
+        knot = tables.first_knot[I[row_unit + r]]
+        middle = 0.5 * (low + high)
+        a, b = first, last - 1
+        while a < b:
+            mid = (a + b) >> 1
+            if tables.knots[knot + mid] < middle:
+                a = mid + 1
+            else:
+                b = mid
+        if a > first and middle - tables.knots[knot + a - 1] < tables.knots[knot + a] - middle:
+            a -= 1
+        kappa = tables.knots[knot + a]
+        score = min(high - kappa, kappa - low) / (high - low)
+        if score > best:
+            best, best_row, best_knot = score, r, a
+    return best_row, best_knot
+
+
+@njit(cache=True)
+def half_range(X, J, M, n, count, side):
+    """Range of the output's centre over the vertices of one half of a split cell."""
+    low, high = 1e308, -1e308
+    t, out = VALUES * M, OUT_VALUES * M
+    for v in range(n):
+        if (X[t + v] >= 0.0) == (side == 1):
+            low, high = min(low, X[out + v]), max(high, X[out + v])
+    for j in range(count):
+        v, u = J[CUT_FROM * M + j] // 3, J[CUT_TO * M + j] // 3
+        s = X[t + v] / (X[t + v] - X[t + u])
+        value = X[out + v] + s * (X[out + u] - X[out + v])
+        low, high = min(low, value), max(high, value)
+    return low, high
+
+
+@njit(cache=True)
+def push_half(F, I, X, J, M, control, stack, cell, cell_rows, system, floats, count, side, row, knot, tag):
+    """Push one half of the cell, split in X[VALUES], as a cell over ``system`` whose states are in J."""
+    rows = I[system + SYS_ROWS]
+    half, half_floats = control[TOP_I], control[TOP_F]
+    total = write_half(F, I, X, J, M, cell, cell_rows, rows, VALUES, count, side, tag, half, half_floats)
+    I[half + CELL_SYSTEM_F], I[half + CELL_SYSTEM_I] = floats, system
+    I[half + CELL_DEPTH] = I[cell + CELL_DEPTH] + 1
+    states = half + CELL_HEADER
+    for r in range(rows):
+        I[states + r] = J[STATE_LOW * M + r]
+        I[states + rows + r] = J[STATE_HIGH * M + r]
+    if side == 0:
+        I[states + rows + row] = knot
+    else:
+        I[states + row] = knot + 1
+    control[TOP_F] = half_floats + 3 * I[half + CELL_CAPACITY]
+    control[TOP_I] = half + cell_ints(rows, total)
+    I[half + CELL_END_F], I[half + CELL_END_I] = control[TOP_F], control[TOP_I]
+    stack[control[STACK_TOP]] = half
+    control[STACK_TOP] += 1
+
+
+@njit(cache=True)
+def split_cell(F, I, X, J, M, control, stack, tables, slot_of_tag, cell, cell_rows, system, floats, row, form, knot, slack):
+    """Push both halves of a cell, less those that the output's centre and ``slack`` exclude.
+
+    ``form`` is the row that the splitting pre-activation has in X, ``row`` the one it has in ``system``.
+    """
+    unit = I[system + SYS_HEADER + I[system + SYS_LEVELS] + 1 + row]
+    plane = tables.first_knot[unit] + knot
+    evaluate_affine(
+        F, I, X, M, cell, VALUES, X[form], X[M + form], X[2 * M + form], X[3 * M + form] - tables.knots[plane]
+    )
+    count = find_cut_edges(F, I, X, J, M, cell, cell_rows, VALUES)
+    link_cut_edges(J, M, slot_of_tag, count)
+    n = I[cell + CELL_VERTICES]
+    for side in (1, 0):
+        low, high = half_range(X, J, M, n, count, side)
+        if low > slack or high < -slack:
+            control[CHILDREN_PRUNED] += 1
+            continue
+        push_half(
+            F, I, X, J, M, control, stack, cell, cell_rows, system, floats, count, side, row, knot, 2 * plane + side
+        )
+
+
+@njit(cache=True)
+def visit(F, I, X, J, M, control, stack, output, tables, slot_of_tag, cell):
+    """Process one cell that has been taken off the stack."""
+    floats, system = I[cell + CELL_SYSTEM_F], I[cell + CELL_SYSTEM_I]
+    rows = I[system + SYS_ROWS]
+    states = cell + CELL_HEADER
+    for r in range(rows):
+        J[STATE_LOW * M + r] = I[states + r]
+        J[STATE_HIGH * M + r] = I[states + rows + r]
+    unstable = bound_units(F, I, X, J, M, tables, cell, system, floats)
+    radius = bound_output(F, I, X, M, system, floats)
+    at = CENTRE_AT * M
+    evaluate_affine(F, I, X, M, cell, OUT_VALUES, X[at], X[at + 1], X[at + 2], X[at + 3])
+    low, high = value_range(X, M, OUT_VALUES, I[cell + CELL_CAPACITY])
+    size = abs(X[at]) + abs(X[at + 1]) + abs(X[at + 2]) + abs(X[at + 3]) + radius
+    slack = radius + MARGIN * size * tables.extent
+    if low > slack or high < -slack:
+        control[PRUNED] += 1
+        return
+    folded, folded_floats = system, floats
+    choices = count_choices(I, J, M, system, control[LEAF_CHOICES])
+    leaf = choices <= control[LEAF_CHOICES]
+    row, knot = -1, 0
+    if not leaf:
+        row, knot = choose_split(I, X, J, M, tables, system)
+    form = row
+    settled = I[system + SYS_UNITS] - unstable
+    if leaf or 4 * settled >= I[system + SYS_UNITS]:
+        folded, folded_floats = control[TOP_I], control[TOP_F]
+        fold(F, I, X, J, M, system, floats, folded, folded_floats)
+        carry_states(I, J, M, tables, system, folded)
+        control[TOP_F] = folded_floats + I[folded + SYS_FLOATS]
+        control[TOP_I] = folded + I[folded + SYS_INTS]
+        control[FOLDS] += 1
+        if not leaf:
+            row = J[NEW_INDEX * M + row]
+    if leaf:
+        control[LEAVES] += 1
+        emit_leaf(F, I, X, J, M, output, tables, slot_of_tag, cell, rows, folded, folded_floats)
+        if low == 0.0 and high == 0.0:
+            control[CONSTANT_CELLS] += 1
+        return
+    split_cell(
+        F, I, X, J, M, control, stack, tables, slot_of_tag, cell, rows, folded, folded_floats, row, form, knot, slack
+    )
+
+
+@njit(cache=True, nogil=True)
+def march(worker, tables, output, budget):
+    """Visit cells until the worker's stack is empty; returns one of the status codes of this module.
+
+    ``worker``: `schedule.WorkerArrays`; ``tables``: `pack.Tables`; ``output``: `schedule.OutputArrays`; ``budget``: about
+    how many weights to read before returning BUDGET_USED.
+    """
+    F, I, X, J = worker.F, worker.I, worker.X, worker.J
+    control, stack, slot_of_tag = worker.control, worker.stack, worker.slot_of_tag
+    M = X.size // X_REGIONS
+    used = 0
+    while control[STACK_TOP] > control[STACK_BOTTOM]:
+        if control[STOP] != 0:
+            return STOPPED
+        if used > budget:
+            return BUDGET_USED
+        cell = stack[control[STACK_TOP] - 1]
+        system = I[cell + CELL_SYSTEM_I]
+        rows, cols, levels = I[system + SYS_ROWS], I[system + SYS_COLS], I[system + SYS_LEVELS]
+        control[TOP_F], control[TOP_I] = I[cell + CELL_END_F], I[cell + CELL_END_I]
+        status = missing_room(F, I, M, control, stack, output, cell, rows, cols, levels)
+        if status != DONE:
+            return status
+        control[STACK_TOP] -= 1
+        control[NODES] += 1
+        control[DEEPEST] = max(control[DEEPEST], I[cell + CELL_DEPTH])
+        used += 200 + rows * cols
+        visit(F, I, X, J, M, control, stack, output, tables, slot_of_tag, cell)
+    return DONE

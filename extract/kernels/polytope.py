@@ -1,0 +1,209 @@
+"""Simple convex polytopes: split by a plane, cut into a polygon, clip that polygon.
+
+Combinatorial throughout: which edges are cut follows from the signs at the vertices alone, zero counting as positive,
+and the order of the corners from the order of the planes around a vertex. At a vertex with planes (a, b, c),
+counter-clockwise seen from outside, the boundary of face ``a`` comes in along plane ``b`` and leaves along ``c``; the
+two ends of an edge on planes (b, c) list these two in opposite order.
+"""
+
+from __future__ import annotations
+
+from numba import njit
+
+from mn_onnx.extract.kernels.lanes import fma, load, splat, store
+from mn_onnx.extract.kernels.memory import (
+    CELL_CAPACITY,
+    CELL_FLOATS,
+    CELL_HEADER,
+    CELL_VERTICES,
+    CUT_FROM,
+    CUT_IN,
+    CUT_NEXT,
+    CUT_OUT,
+    CUT_PREVIOUS,
+    CUT_TO,
+    CUT_X,
+    CUT_Y,
+    CUT_Z,
+    NEW_INDEX,
+    POLY_VALUES,
+    padded,
+)
+
+
+@njit(cache=True)
+def evaluate_affine(F, I, X, M, cell, region, a0, a1, a2, a3):
+    """``X[region]`` = a . x + a3 at the cell's vertices (and at its padding, which repeats the last one)."""
+    x = I[cell + CELL_FLOATS]
+    capacity = I[cell + CELL_CAPACITY]
+    b0, b1, b2, b3 = splat(a0), splat(a1), splat(a2), splat(a3)
+    out = region * M
+    for v in range(0, capacity, 4):
+        value = fma(b0, load(F, x + v), fma(b1, load(F, x + capacity + v), fma(b2, load(F, x + 2 * capacity + v), b3)))
+        store(X, out + v, value)
+
+
+@njit(cache=True)
+def find_cut_edges(F, I, X, J, M, cell, rows, values):
+    """Collect the edges on which ``X[values]`` changes sign, from the negative to the positive end.
+
+    Fills CUT_FROM and CUT_TO (``3 * vertex + slot`` at either end), the corner's position CUT_X, CUT_Y, CUT_Z and the
+    tags CUT_IN, CUT_OUT along which the polygon of the cut comes in and leaves, seen from the positive side.
+    Returns the number of edges.
+    """
+    n = I[cell + CELL_VERTICES]
+    tags = cell + CELL_HEADER + 2 * rows
+    neighbours = tags + 3 * n
+    x = I[cell + CELL_FLOATS]
+    capacity = I[cell + CELL_CAPACITY]
+    t = values * M
+    count = 0
+    for v in range(n):
+        tv = X[t + v]
+        if tv >= 0.0:
+            continue
+        for i in range(3):
+            u = I[neighbours + 3 * v + i]
+            tu = X[t + u]
+            if tu < 0.0:
+                continue
+            j = 0
+            while I[neighbours + 3 * u + j] != v:
+                j += 1
+            k1 = i + 1 if i < 2 else 0
+            k2 = i - 1 if i > 0 else 2
+            s = tv / (tv - tu)
+            J[CUT_FROM * M + count] = 3 * v + i
+            J[CUT_TO * M + count] = 3 * u + j
+            J[CUT_OUT * M + count] = I[tags + 3 * v + k1]
+            J[CUT_IN * M + count] = I[tags + 3 * v + k2]
+            for axis in range(3):
+                at = x + axis * capacity
+                X[(CUT_X + axis) * M + count] = F[at + v] + s * (F[at + u] - F[at + v])
+            count += 1
+    return count
+
+
+@njit(cache=True)
+def link_cut_edges(J, M, slot_of_tag, count):
+    """Order the corners of a cut: CUT_NEXT and CUT_PREVIOUS. ``slot_of_tag`` is scratch of one entry per tag."""
+    for j in range(count):
+        slot_of_tag[J[CUT_IN * M + j]] = j
+    for j in range(count):
+        following = slot_of_tag[J[CUT_OUT * M + j]]
+        J[CUT_NEXT * M + j] = following
+        J[CUT_PREVIOUS * M + following] = j
+
+
+@njit(cache=True)
+def write_half(F, I, X, J, M, cell, rows, half_rows, values, count, side, tag, half, half_floats):
+    """Write one half of a split cell's polytope; the caller fills the rest of the header and the states.
+
+    ``side`` 0 keeps the negative vertices, 1 the others. ``half`` and ``half_floats`` are its places in I and F.
+    ``rows`` and ``half_rows`` are the rows of the cell's and the half's systems. Returns the number of vertices.
+    """
+    n = I[cell + CELL_VERTICES]
+    tags = cell + CELL_HEADER + 2 * rows
+    neighbours = tags + 3 * n
+    x = I[cell + CELL_FLOATS]
+    capacity = I[cell + CELL_CAPACITY]
+    t = values * M
+    kept = 0
+    for v in range(n):
+        if (X[t + v] >= 0.0) == (side == 1):
+            J[NEW_INDEX * M + v] = kept
+            kept += 1
+    total = kept + count
+    new_capacity = padded(total)
+    new_tags = half + CELL_HEADER + 2 * half_rows
+    new_neighbours = new_tags + 3 * total
+    I[half + CELL_VERTICES] = total
+    I[half + CELL_CAPACITY] = new_capacity
+    I[half + CELL_FLOATS] = half_floats
+    for v in range(n):
+        if (X[t + v] >= 0.0) != (side == 1):
+            continue
+        w = J[NEW_INDEX * M + v]
+        for axis in range(3):
+            F[half_floats + axis * new_capacity + w] = F[x + axis * capacity + v]
+        for i in range(3):
+            I[new_tags + 3 * w + i] = I[tags + 3 * v + i]
+            # An edge that is cut has its far end on the other side; that entry is set below.
+            I[new_neighbours + 3 * w + i] = J[NEW_INDEX * M + I[neighbours + 3 * v + i]]
+    near = (CUT_FROM if side == 0 else CUT_TO) * M
+    for j in range(count):
+        w = kept + j
+        for axis in range(3):
+            F[half_floats + axis * new_capacity + w] = X[(CUT_X + axis) * M + j]
+        end = J[near + j]
+        v = end // 3
+        i = end - 3 * v
+        I[new_neighbours + 3 * J[NEW_INDEX * M + v] + i] = w
+        incoming, outgoing = J[CUT_IN * M + j], J[CUT_OUT * M + j]
+        following, previous = kept + J[CUT_NEXT * M + j], kept + J[CUT_PREVIOUS * M + j]
+        I[new_tags + 3 * w] = tag
+        I[new_neighbours + 3 * w] = J[NEW_INDEX * M + v]
+        if side == 0:
+            I[new_tags + 3 * w + 1] = incoming
+            I[new_tags + 3 * w + 2] = outgoing
+            I[new_neighbours + 3 * w + 1] = following
+            I[new_neighbours + 3 * w + 2] = previous
+        else:
+            I[new_tags + 3 * w + 1] = outgoing
+            I[new_tags + 3 * w + 2] = incoming
+            I[new_neighbours + 3 * w + 1] = previous
+            I[new_neighbours + 3 * w + 2] = following
+    for axis in range(3):
+        at = half_floats + axis * new_capacity
+        for w in range(total, new_capacity):
+            F[at + w] = F[at + total - 1]
+    return total
+
+
+@njit(cache=True)
+def read_cut_polygon(X, J, M, count, polygon, tags):
+    """Copy a linked cut to a polygon: corners in ``X[polygon : polygon + 3]``, the tag of each edge in ``J[tags]``."""
+    j = 0
+    for corner in range(count):
+        for axis in range(3):
+            X[(polygon + axis) * M + corner] = X[(CUT_X + axis) * M + j]
+        J[tags * M + corner] = J[CUT_OUT * M + j]
+        j = J[CUT_NEXT * M + j]
+
+
+@njit(cache=True)
+def clip_polygon(X, J, M, count, polygon, tags, result, result_tags, a0, a1, a2, a3, side, tag):
+    """Keep the part of a convex polygon where a . x + a3 is negative (side 0) or not (side 1).
+
+    The new edge gets ``tag``. Returns the number of corners of the result, 0 where nothing is left.
+    """
+    px, py, pz = polygon * M, (polygon + 1) * M, (polygon + 2) * M
+    values = POLY_VALUES * M
+    inside = 0
+    for j in range(count):
+        value = a0 * X[px + j] + (a1 * X[py + j] + (a2 * X[pz + j] + a3))
+        X[values + j] = value
+        if (value >= 0.0) == (side == 1):
+            inside += 1
+    if inside == 0:
+        return 0
+    out = 0
+    rx, ry, rz = result * M, (result + 1) * M, (result + 2) * M
+    for j in range(count):
+        k = j + 1 if j + 1 < count else 0
+        here, there = X[values + j], X[values + k]
+        here_in, there_in = (here >= 0.0) == (side == 1), (there >= 0.0) == (side == 1)
+        if here_in:
+            X[rx + out], X[ry + out], X[rz + out] = X[px + j], X[py + j], X[pz + j]
+            J[result_tags * M + out] = J[tags * M + j]
+            out += 1
+        if here_in != there_in:
+            # From the negative end, so that both sides of the plane get the same point.
+            a, b, ta, tb = (j, k, here, there) if here < 0.0 else (k, j, there, here)
+            s = ta / (ta - tb)
+            X[rx + out] = X[px + a] + s * (X[px + b] - X[px + a])
+            X[ry + out] = X[py + a] + s * (X[py + b] - X[py + a])
+            X[rz + out] = X[pz + a] + s * (X[pz + b] - X[pz + a])
+            J[result_tags * M + out] = tag if here_in else J[tags * M + j]
+            out += 1
+    return out

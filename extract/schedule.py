@@ -1,0 +1,358 @@
+"""The traversal as its users call it: workers on threads, subtrees passed between them, output in canonical order.
+
+A worker goes through its subtree depth first. When another worker has nothing to do, the worker gives away the cell at
+the bottom of its stack: the largest piece of what it has left, and the last in its order. The polygons of that piece
+come right after the giver's remaining ones, so the order of the output does not depend on who did what.
+"""
+
+from __future__ import annotations
+
+import os
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mn_onnx.extract.kernels import march as kernel
+from mn_onnx.extract.kernels.memory import (
+    CELL_END_F,
+    CELL_END_I,
+    CELL_FLOATS,
+    CELL_SYSTEM_F,
+    CELL_SYSTEM_I,
+    J_REGIONS,
+    SYS_FLOATS,
+    SYS_INTS,
+    X_REGIONS,
+)
+from mn_onnx.extract.pack import Packed, pack
+from mn_onnx.extract.soup import PolygonSoup
+from mn_onnx.ir.network import Network
+
+Floats = NDArray[np.float64]
+Integers = NDArray[np.int64]
+
+LEAF_CHOICES = 8
+BUDGET = 20_000_000  # weights read between two looks at the world: some tens of milliseconds
+BUFFER_CORNERS = 1 << 16
+
+
+class WorkerArrays(NamedTuple):
+    """One worker's memory; see `kernels.memory`."""
+
+    F: Floats
+    I: Integers  # noqa: E741
+    X: Floats
+    J: Integers
+    control: Integers
+    stack: Integers
+    slot_of_tag: Integers
+
+
+class OutputArrays(NamedTuple):
+    """One worker's output buffers; ``counts`` holds the numbers of polygons and corners in them."""
+
+    counts: Integers
+    sizes: NDArray[np.int32]
+    gradients: Floats
+    positions: Floats
+    keys: Integers
+    box_faces: NDArray[np.int8]
+
+
+@dataclass
+class TraversalStatistics:
+    """What the traversal did."""
+
+    nodes: int = 0
+    pruned: int = 0
+    children_pruned: int = 0
+    leaves: int = 0
+    folds: int = 0
+    constant_cells: int = 0
+    deepest: int = 0
+    subtrees: int = 0
+    threads: int = 1
+
+
+@dataclass(frozen=True)
+class Progress:
+    """A snapshot of a running traversal."""
+
+    nodes: int
+    polygons: int
+    fraction: float
+
+
+@dataclass
+class _Chunk:
+    sizes: NDArray[np.int32]
+    gradients: Floats
+    positions: Floats
+    keys: Integers
+    box_faces: NDArray[np.int8]
+
+
+@dataclass
+class _Task:
+    """A subtree: a system and a cell as arena contents, and the polygons found in it so far."""
+
+    F: Floats
+    I: Integers  # noqa: E741
+    root: int
+    volume: float
+    chunks: list[_Chunk] = field(default_factory=list)
+    following: _Task | None = None
+
+
+class _Worker:
+    """Owns arenas, and runs one task at a time."""
+
+    def __init__(self, packed: Packed) -> None:
+        largest = max(packed.rows, packed.cols) + 8
+        self.packed = packed
+        self.F = np.empty(max(1 << 16, 2 * packed.F.size))
+        self.I = np.empty(max(1 << 16, 2 * packed.I.size), np.int64)
+        self.control = np.zeros(kernel.CONTROL_SIZE, np.int64)
+        self.control[kernel.LEAF_CHOICES] = LEAF_CHOICES
+        self.stack = np.zeros(1024, np.int64)
+        self.slot_of_tag = np.zeros(packed.tables.tag_hash.shape[0], np.int64)
+        self._set_scratch(max(512, -(-largest // 4) * 4))
+        self._set_output(BUFFER_CORNERS // 4, BUFFER_CORNERS)
+        self.polygons = 0
+
+    def _set_scratch(self, region: int) -> None:
+        self.X = np.zeros(X_REGIONS * region)
+        self.J = np.zeros(J_REGIONS * region, np.int64)
+
+    def _set_output(self, polygons: int, corners: int) -> None:
+        self.output = OutputArrays(
+            np.zeros(2, np.int64),
+            np.empty(polygons, np.int32),
+            np.empty((polygons, 3)),
+            np.empty((corners, 3)),
+            np.empty((corners, 2), np.int64),
+            np.empty(corners, np.int8),
+        )
+
+    def start(self, task: _Task) -> None:
+        self._reserve(2 * task.F.size, 2 * task.I.size)
+        self.F[: task.F.size] = task.F
+        self.I[: task.I.size] = task.I
+        self.stack[0] = task.root
+        self.control[kernel.STACK_BOTTOM] = 0
+        self.control[kernel.STACK_TOP] = 1
+
+    def _reserve(self, floats: int, integers: int) -> None:
+        if floats > self.F.size:
+            grown = np.empty(floats + floats // 2)
+            grown[: self.F.size] = self.F
+            self.F = grown
+        if integers > self.I.size:
+            grown_i = np.empty(integers + integers // 2, np.int64)
+            grown_i[: self.I.size] = self.I
+            self.I = grown_i
+
+    def flush(self, task: _Task) -> None:
+        """Move the polygons in the buffers to the task."""
+        polygons, corners = (int(count) for count in self.output.counts)
+        if polygons:
+            out = self.output
+            task.chunks.append(
+                _Chunk(
+                    out.sizes[:polygons].copy(),
+                    out.gradients[:polygons].copy(),
+                    out.positions[:corners].copy(),
+                    out.keys[:corners].copy(),
+                    out.box_faces[:corners].copy(),
+                )
+            )
+            self.polygons += polygons
+            out.counts[:] = 0
+
+    def run(self, task: _Task, budget: int) -> bool:
+        """Work on the task for about ``budget``; True when it is finished or the worker was told to stop."""
+        while True:
+            arrays = WorkerArrays(self.F, self.I, self.X, self.J, self.control, self.stack, self.slot_of_tag)
+            status = kernel.march(arrays, self.packed.tables, self.output, budget)
+            if status in (kernel.DONE, kernel.STOPPED):
+                self.flush(task)
+                return True
+            if status == kernel.BUDGET_USED:
+                return False
+            if status == kernel.ARENA_FULL:
+                self._reserve(int(self.control[kernel.NEED_F]), int(self.control[kernel.NEED_I]))
+            elif status == kernel.SCRATCH_FULL:
+                self._set_scratch(-(-2 * int(self.control[kernel.NEED_I]) // 4) * 4)
+            elif status == kernel.STACK_FULL:
+                self.stack = np.concatenate([self.stack, np.zeros_like(self.stack)])
+            else:
+                self.flush(task)
+                polygons, corners = int(self.control[kernel.NEED_POLYGONS]), int(self.control[kernel.NEED_CORNERS])
+                if polygons > self.output.sizes.size or corners > self.output.keys.shape[0]:
+                    self._set_output(2 * polygons, 2 * corners)
+
+    def give_away(self) -> _Task | None:
+        """Take the bottom cell off the stack as a task of its own, if at least one other cell remains."""
+        bottom, top = int(self.control[kernel.STACK_BOTTOM]), int(self.control[kernel.STACK_TOP])
+        if top - bottom < 2:
+            return None
+        cell = int(self.stack[bottom])
+        self.control[kernel.STACK_BOTTOM] += 1
+        header = self.I[cell : cell + CELL_END_I + 1]
+        system_f, system_i = int(header[CELL_SYSTEM_F]), int(header[CELL_SYSTEM_I])
+        floats, integers = int(self.I[system_i + SYS_FLOATS]), int(self.I[system_i + SYS_INTS])
+        cell_f, end_f, end_i = int(header[CELL_FLOATS]), int(header[CELL_END_F]), int(header[CELL_END_I])
+        F = np.concatenate([self.F[system_f : system_f + floats], self.F[cell_f:end_f]])
+        I = np.concatenate([self.I[system_i : system_i + integers], self.I[cell:end_i]])  # noqa: E741
+        I[integers + CELL_SYSTEM_F], I[integers + CELL_SYSTEM_I] = 0, 0
+        I[integers + CELL_FLOATS] = floats
+        I[integers + CELL_END_F], I[integers + CELL_END_I] = F.size, I.size
+        return _Task(F, I, integers, 0.0)
+
+
+class _Pool:
+    """Tasks waiting, workers idle, and the first error or interrupt."""
+
+    def __init__(self, first: _Task, workers: int) -> None:
+        self.condition = threading.Condition()
+        self.waiting = [first]
+        self.idle = 0
+        self.workers = workers
+        self.subtrees = 1
+        self.error: BaseException | None = None
+        self.finished = False
+
+    def take(self) -> _Task | None:
+        with self.condition:
+            self.idle += 1
+            while not self.waiting:
+                if self.finished or self.error is not None or self.idle == self.workers:
+                    self.finished = True
+                    self.condition.notify_all()
+                    return None
+                self.condition.wait()
+            self.idle -= 1
+            return self.waiting.pop()
+
+    def wants_more(self) -> bool:
+        return self.idle > len(self.waiting)
+
+    def put(self, giver: _Task, task: _Task) -> None:
+        with self.condition:
+            task.following = giver.following
+            giver.following = task
+            self.waiting.append(task)
+            self.subtrees += 1
+            self.condition.notify()
+
+    def fail(self, error: BaseException) -> None:
+        with self.condition:
+            self.error = self.error or error
+            self.condition.notify_all()
+
+
+def traverse(
+    network: Network,
+    lower: Floats,
+    upper: Floats,
+    *,
+    threads: int | None = None,
+    progress: Callable[[Progress], None] | None = None,
+) -> tuple[PolygonSoup, TraversalStatistics]:
+    """Find every polygon of the level set f = 0 of a canonical network in a box.
+
+    ``lower``, ``upper``: float64 [3]. ``threads``: number of worker threads, all cores by default; the result does not
+    depend on it. ``progress`` is called from the calling thread a few times a second.
+
+    Raises ``ValueError`` for a network that is not canonical or an empty box. An interrupt (KeyboardInterrupt) stops
+    all workers and is passed on.
+    """
+    packed = pack(network, lower, upper)
+    count = threads or os.cpu_count() or 1
+    if count < 1:
+        raise ValueError(f"threads must be at least 1, not {count}")
+    first = _Task(packed.F, packed.I, packed.root, 1.0)
+    pool = _Pool(first, count)
+    workers = [_Worker(packed) for _ in range(count)]
+
+    def work(worker: _Worker) -> None:
+        try:
+            while (task := pool.take()) is not None:
+                worker.start(task)
+                while not worker.run(task, BUDGET if not pool.wants_more() else BUDGET // 50):
+                    if pool.wants_more() and (given := worker.give_away()) is not None:
+                        pool.put(task, given)
+        except BaseException as error:  # whatever it is, the caller gets it
+            pool.fail(error)
+
+    crew = [threading.Thread(target=work, args=(worker,), daemon=True) for worker in workers]
+    for thread in crew:
+        thread.start()
+    try:
+        while any(thread.is_alive() for thread in crew):
+            next(thread for thread in crew if thread.is_alive()).join(0.2)
+            if progress is not None:
+                nodes = sum(int(worker.control[kernel.NODES]) for worker in workers)
+                progress(Progress(nodes, sum(w.polygons + int(w.output.counts[0]) for w in workers), 0.0))
+    finally:
+        for worker in workers:
+            worker.control[kernel.STOP] = 1
+        for thread in crew:
+            thread.join()
+    if pool.error is not None:
+        raise pool.error
+    return _collect(first), _statistics(workers, pool)
+
+
+def _statistics(workers: list[_Worker], pool: _Pool) -> TraversalStatistics:
+    def total(entry: int) -> int:
+        return sum(int(worker.control[entry]) for worker in workers)
+
+    return TraversalStatistics(
+        nodes=total(kernel.NODES),
+        pruned=total(kernel.PRUNED),
+        children_pruned=total(kernel.CHILDREN_PRUNED),
+        leaves=total(kernel.LEAVES),
+        folds=total(kernel.FOLDS),
+        constant_cells=total(kernel.CONSTANT_CELLS),
+        deepest=max(int(worker.control[kernel.DEEPEST]) for worker in workers),
+        subtrees=pool.subtrees,
+        threads=len(workers),
+    )
+
+
+def _collect(first: _Task) -> PolygonSoup:
+    chunks: list[_Chunk] = []
+    task: _Task | None = first
+    while task is not None:
+        chunks.extend(task.chunks)
+        task = task.following
+    polygons = sum(chunk.sizes.size for chunk in chunks)
+    corners = sum(chunk.box_faces.size for chunk in chunks)
+    offsets = np.zeros(polygons + 1, np.int64)
+    soup = PolygonSoup(
+        offsets,
+        np.empty((corners, 3)),
+        np.empty((corners, 2), np.uint64),
+        np.empty(corners, np.int8),
+        np.empty((polygons, 3)),
+        np.zeros(polygons),
+    )
+    p = c = 0
+    # Chunks are released one by one, so that the soup and they are never held twice.
+    chunks.reverse()
+    while chunks:
+        chunk = chunks.pop()
+        q, d = p + chunk.sizes.size, c + chunk.box_faces.size
+        np.cumsum(chunk.sizes, out=offsets[p + 1 : q + 1])
+        offsets[p + 1 : q + 1] += c
+        soup.gradients[p:q] = chunk.gradients
+        soup.positions[c:d] = chunk.positions
+        soup.keys[c:d] = chunk.keys.view(np.uint64)
+        soup.box_faces[c:d] = chunk.box_faces
+        p, c = q, d
+    return soup
