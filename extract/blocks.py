@@ -1,0 +1,106 @@
+"""Fixed blocks of work on threads, and grouping of items by a small integer with a counting sort.
+
+Kernels release the interpreter lock and write disjoint parts of their outputs. The blocks have a fixed size, never
+one that depends on the number of threads, so that results are the same for any number of threads.
+"""
+
+from __future__ import annotations
+
+import itertools
+import os
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+BLOCK_SIZE = 1 << 16
+_TASKS_PER_THREAD = 4
+
+Indices = NDArray[np.integer[Any]]
+
+
+def resolve_threads(threads: int | None) -> int:
+    """The number of threads to use: ``threads``, or all cores this process may run on.
+
+    Raises ValueError below 1.
+    """
+    if threads is None:
+        return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    if threads < 1:
+        raise ValueError(f"threads is {threads}, but at least 1 is needed (None takes all cores)")
+    return threads
+
+
+def block_count(n_items: int) -> int:
+    """The number of blocks of `BLOCK_SIZE` that cover ``n_items``."""
+    return -(-n_items // BLOCK_SIZE)
+
+
+def run_blocks(work: Callable[[int, int], object], n_blocks: int, threads: int) -> None:
+    """Call ``work(first, last)`` on ranges that cover the blocks ``0 .. n_blocks``, on ``threads`` threads.
+
+    An exception in ``work``, or Ctrl-C in the main thread, cancels the ranges not yet begun and is raised.
+    """
+    n_tasks = max(1, min(n_blocks, threads * _TASKS_PER_THREAD))
+    limits = [n_blocks * task // n_tasks for task in range(n_tasks + 1)]
+    ranges = list(itertools.pairwise(limits))
+    if threads == 1 or n_tasks == 1:
+        for first, last in ranges:
+            work(first, last)
+        return
+    with ThreadPoolExecutor(threads) as pool:
+        futures = [pool.submit(work, first, last) for first, last in ranges]
+        try:
+            for future in futures:
+                future.result()
+        except BaseException:
+            pool.shutdown(wait=False, cancel_futures=True)
+            raise
+
+
+def index_dtype(n_items: int) -> type[Any]:
+    """int32 where it can number ``n_items``, else int64."""
+    return np.int32 if n_items <= np.iinfo(np.int32).max else np.int64
+
+
+@numba.njit(cache=True, nogil=True)
+def _count_groups(
+    groups: NDArray[np.uint16], block_size: int, first: int, last: int, counts: NDArray[np.int64]
+) -> None:
+    for block in range(first, last):
+        for item in range(block * block_size, min((block + 1) * block_size, groups.size)):
+            counts[block, groups[item]] += 1
+
+
+@numba.njit(cache=True, nogil=True)
+def _place_items(
+    groups: NDArray[np.uint16], block_size: int, first: int, last: int, cursors: NDArray[np.int64], order: Indices
+) -> None:
+    for block in range(first, last):
+        for item in range(block * block_size, min((block + 1) * block_size, groups.size)):
+            group = groups[item]
+            order[cursors[block, group]] = item
+            cursors[block, group] += 1
+
+
+def group_items(groups: NDArray[np.uint16], n_groups: int, threads: int) -> tuple[Indices, NDArray[np.int64]]:
+    """Sort item numbers by group with a stable counting sort.
+
+    ``groups``: uint16 [n], each below ``n_groups``. Returns ``order``, the item numbers (int32 or int64 [n]) by group
+    and ascending within a group, and ``starts``, int64 [n_groups + 1]: group ``g`` is
+    ``order[starts[g]:starts[g + 1]]``.
+    """
+    n_blocks = block_count(groups.size)
+    counts = np.zeros((n_blocks, n_groups), np.int64)
+    run_blocks(lambda first, last: _count_groups(groups, BLOCK_SIZE, first, last, counts), n_blocks, threads)
+    starts = np.zeros(n_groups + 1, np.int64)
+    np.cumsum(counts.sum(axis=0), out=starts[1:])
+    cursors = np.cumsum(counts, axis=0)
+    cursors -= counts
+    cursors += starts[:-1]
+    order = np.empty(groups.size, index_dtype(groups.size))
+    run_blocks(lambda first, last: _place_items(groups, BLOCK_SIZE, first, last, cursors, order), n_blocks, threads)
+    return order, starts

@@ -1,0 +1,152 @@
+"""Half-edge pairing: which corner's edge runs along the same edge in the neighbouring polygon.
+
+The half-edge of corner ``c`` runs from the vertex of ``c`` to the vertex of the next corner of its polygon.
+"""
+
+from __future__ import annotations
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from mn_onnx.extract.blocks import BLOCK_SIZE, Indices, block_count, group_items, index_dtype, run_blocks
+
+_MAX_PARTITIONS = 1 << 16
+_CORNERS_PER_PARTITION = 1 << 13
+
+
+def half_edge_heads(offsets: NDArray[np.int64], corners: Indices) -> Indices:
+    """The vertex at which each half-edge ends: [c], of the dtype of ``corners``."""
+    heads = np.empty_like(corners)
+    if corners.size:
+        heads[:-1] = corners[1:]
+        heads[offsets[1:] - 1] = corners[offsets[:-1]]
+    return heads
+
+
+def preceding_corners(offsets: NDArray[np.int64]) -> Indices:
+    """The corner before each corner in its polygon, [c]."""
+    n_corners = int(offsets[-1])
+    preceding = np.arange(-1, n_corners - 1, dtype=index_dtype(n_corners))
+    preceding[offsets[:-1]] = offsets[1:] - 1
+    return preceding
+
+
+@numba.njit(cache=True, nogil=True)
+def _sort_partitions(
+    corners: Indices,
+    order: Indices,
+    partition_starts: NDArray[np.int64],
+    shift: int,
+    first: int,
+    last: int,
+    vertex_starts: NDArray[np.int64],
+) -> None:
+    """Sort the corners of partitions ``first .. last`` by vertex, in place and stably."""
+    for partition in range(first, last):
+        begin, end = partition_starts[partition], partition_starts[partition + 1]
+        first_vertex = partition << shift
+        last_vertex = min((partition + 1) << shift, vertex_starts.size - 1)
+        cursors = np.zeros(last_vertex - first_vertex, np.int64)
+        for position in range(begin, end):
+            cursors[corners[order[position]] - first_vertex] += 1
+        total = begin
+        for vertex in range(first_vertex, last_vertex):
+            count = cursors[vertex - first_vertex]
+            vertex_starts[vertex] = cursors[vertex - first_vertex] = total
+            total += count
+        unsorted = order[begin:end].copy()
+        for corner in unsorted:
+            vertex = corners[corner] - first_vertex
+            order[cursors[vertex]] = corner
+            cursors[vertex] += 1
+
+
+def corners_by_vertex(corners: Indices, n_vertices: int, threads: int) -> tuple[Indices, NDArray[np.int64]]:
+    """Corners sorted by vertex: ``order`` [c] and ``starts``, int64 [v + 1].
+
+    The corners at vertex ``i`` are ``order[starts[i]:starts[i + 1]]``, ascending.
+    """
+    wanted = max(1, min(_MAX_PARTITIONS, corners.size // _CORNERS_PER_PARTITION))
+    shift = (-(-n_vertices // wanted) - 1).bit_length()
+    n_partitions = -(-n_vertices >> shift)
+    order, partition_starts = group_items((corners >> shift).astype(np.uint16), n_partitions, threads)
+    starts = np.empty(n_vertices + 1, np.int64)
+    starts[n_vertices] = corners.size
+    run_blocks(
+        lambda first, last: _sort_partitions(corners, order, partition_starts, shift, first, last, starts),
+        n_partitions,
+        threads,
+    )
+    return order, starts
+
+
+@numba.njit(cache=True, nogil=True)
+def _match_at_vertices(
+    offsets: NDArray[np.int64],
+    corners: Indices,
+    heads: Indices,
+    preceding: Indices,
+    order: Indices,
+    starts: NDArray[np.int64],
+    widest: int,
+    block_size: int,
+    first: int,
+    last: int,
+    twins: Indices,
+) -> None:
+    """Pair the half-edges at the vertices of blocks ``first .. last``.
+
+    Both half-edges of an edge are seen from either end: the outgoing one of a corner there, the incoming one of the
+    corner before. The end with fewer corners looks, so that a vertex of huge valence costs no more than its
+    neighbours.
+    """
+    for vertex in range(first * block_size, min(last * block_size, starts.size - 1)):
+        begin, end = starts[vertex], starts[vertex + 1]
+        for position in range(begin, end):
+            corner = order[position]
+            head = heads[corner]
+            excess = (end - begin) - (starts[head + 1] - starts[head])
+            if excess > 0 or (excess == 0 and vertex >= head):
+                continue
+            n_outgoing = n_incoming = 0
+            partner = corner
+            for other in range(begin, end):
+                if heads[order[other]] == head:
+                    n_outgoing += 1
+                before = preceding[order[other]]
+                if corners[before] == head:
+                    n_incoming += 1
+                    partner = before
+            if n_outgoing != 1 or n_incoming != 1:
+                continue
+            if abs(partner - corner) < widest:
+                polygon = np.searchsorted(offsets, corner, side="right")
+                if offsets[polygon - 1] <= partner < offsets[polygon]:
+                    continue
+            twins[corner] = partner
+            twins[partner] = corner
+
+
+def pair_half_edges(offsets: NDArray[np.int64], corners: Indices, n_vertices: int, threads: int) -> Indices:
+    """The twin of every half-edge, -1 where it has none.
+
+    ``offsets``: int64 [p + 1]; ``corners``: int32 or int64 [c], the vertex of each corner, below ``n_vertices``.
+    Two half-edges are twins if they join the same two vertices in opposite directions, belong to different polygons
+    and no third half-edge joins these vertices. Returns the twins as corner numbers, [c].
+    """
+    twins = np.full(corners.size, -1, index_dtype(corners.size))
+    if not corners.size:
+        return twins
+    order, starts = corners_by_vertex(corners, n_vertices, threads)
+    heads = half_edge_heads(offsets, corners)
+    preceding = preceding_corners(offsets)
+    widest = int(np.diff(offsets).max())
+    run_blocks(
+        lambda first, last: _match_at_vertices(
+            offsets, corners, heads, preceding, order, starts, widest, BLOCK_SIZE, first, last, twins
+        ),
+        block_count(n_vertices),
+        threads,
+    )
+    return twins
