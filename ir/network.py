@@ -7,8 +7,8 @@ A network is a DAG of scalar *units*. Unit ``g`` has an affine *pre-activation*
 over *variables* ``v``: the ``input_dim`` coordinates first, then the outputs of earlier units in order. The unit maps
 ``t_g`` through one scalar function per output. The network's value is one more affine row.
 
-At the *imported* stage a scalar function may be a smooth `Expression`; at the *canonical* stage every unit carries a `table`
-(merged knots; one slope and intercept per output and interval).
+At the *imported* stage a scalar function may be a smooth `Expression`; at the *canonical* stage every unit carries a
+`table` (merged knots; one slope and intercept per output and interval).
 """
 
 from __future__ import annotations
