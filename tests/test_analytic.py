@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 
+from mn_onnx.extract.invariants import check_invariants
+from mn_onnx.extract.weld import weld
 from oracle.corpus import CORPUS, Case
 from oracle.level_set import exact_level_set
 from oracle.sketch import as_network
+from oracle.soups import as_soup
 
 
 @pytest.mark.parametrize("case", CORPUS, ids=str)
@@ -24,3 +28,23 @@ def test_oracle_agrees_with_the_table(case: Case) -> None:
         assert exact.enclosed_volume == (exact.inner_volume if exact.facets else 0)
     if case.counts:
         assert (len(exact.facets), len(exact.vertices), exact.n_edges) == case.counts
+
+
+@pytest.mark.parametrize("case", CORPUS, ids=str)
+def test_welding_the_exact_polygons_gives_the_surface_of_the_table(case: Case) -> None:
+    """Welding and measuring apart from the traversal, on degenerate meshes too."""
+    exact = exact_level_set(as_network(case.body), *case.bounds)
+    surface = weld(as_soup(exact))
+    invariants = check_invariants(surface, bounds=np.array(case.bounds).T)
+    assert invariants.problems() == []
+    assert (invariants.polygons, invariants.vertices, invariants.edges) == (
+        len(exact.facets),
+        len(exact.vertices),
+        exact.n_edges,
+    )
+    assert invariants.euler == case.euler
+    assert len(invariants.components) == case.components
+    assert invariants.area == pytest.approx(case.area, abs=1e-12)
+    if exact.facets and not case.open_faces:
+        assert invariants.volume == pytest.approx(case.volume, abs=1e-12)
+    assert invariants.boundary_edges == len(exact.boundary_edges)

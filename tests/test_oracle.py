@@ -13,7 +13,7 @@ import pytest
 from mn_onnx.ir.network import AffineRow, KnotTable, Network, Unit
 from oracle.level_set import Facet, LevelSet, exact_level_set
 from oracle.polytope import Affine, Polytope
-from oracle.random_networks import ACTIVATIONS, RandomNetwork
+from oracle.random_networks import ACTIVATIONS, RandomNetwork, table_values
 from oracle.regions import activation_regions
 from oracle.sketch import Sketch, affine_row, as_network, as_onnx, evaluate
 
@@ -192,14 +192,4 @@ def test_units_and_model_of_a_sketch_are_the_same_function(activation: str) -> N
     session = onnxruntime.InferenceSession(as_onnx(body).SerializeToString(), providers=["CPUExecutionProvider"])
     values = evaluate(body, points)
     np.testing.assert_allclose(session.run(None, {"x": points})[0][:, 0], values, atol=2e-6)
-    network = as_network(body)
-    variables = list(points.T.astype(np.float64))
-    for unit in network.units:
-        activations = unit.row.bias + sum(
-            w * variables[c] for c, w in zip(unit.row.columns, unit.row.weights, strict=True)
-        )
-        variables += list(unit.table.evaluate(activations))
-    total = network.output.bias + sum(
-        w * variables[c] for c, w in zip(network.output.columns, network.output.weights, strict=True)
-    )
-    np.testing.assert_allclose(total, values, atol=1e-13)
+    np.testing.assert_allclose(table_values(as_network(body), points), values, atol=1e-13)

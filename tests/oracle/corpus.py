@@ -78,6 +78,7 @@ CLOSED = (
     Case("cuboctahedron", cuboctahedron(), 5 / 6, 3 + sqrt(3), 2),
     Case("tetrakis_hexahedron", tetrakis_hexahedron(), 4 / 9, 4 * sqrt(5) / 3, 2, counts=(24, 14, 36)),
     _fan_case(12),
+    _fan_case(16),
     Case("two_boxes", TWO_BOXES, 1 / 4, 3, 4, components=2),
     Case("notched_cube", NOTCHED_CUBE, 15 / 16, 6.5, 2),
     Case("holed_frame", HOLED_FRAME, 27 / 32, 63 / 8, 0),
