@@ -1,1 +1,69 @@
-"""mn-onnx: exact level sets of networks exported to ONNX."""
+"""mn-onnx: exact level sets of networks exported to ONNX.
+
+`extract` makes the mesh, `load` reads a model to look at it or to extract several times, `write_mesh` and `read_mesh`
+store surfaces. Errors derive from `MnOnnxError`. Names are imported on first use, so that the command line starts fast.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from types import ModuleType
+from typing import TYPE_CHECKING, Any
+
+import mn_onnx.extract as _extract_package
+
+if TYPE_CHECKING:
+    from mn_onnx.errors import CheckFailed, MnOnnxError, ModelRefused, Problem, UsageError
+    from mn_onnx.extract.files import read_mesh, write_mesh
+    from mn_onnx.extract.surface import Surface
+    from mn_onnx.extraction import extract
+    from mn_onnx.model import Model, load
+
+__version__ = "0.1.0"
+
+_HOMES = {
+    "CheckFailed": "mn_onnx.errors",
+    "MnOnnxError": "mn_onnx.errors",
+    "Model": "mn_onnx.model",
+    "ModelRefused": "mn_onnx.errors",
+    "Problem": "mn_onnx.errors",
+    "Surface": "mn_onnx.extract.surface",
+    "UsageError": "mn_onnx.errors",
+    "load": "mn_onnx.model",
+    "read_mesh": "mn_onnx.extract.files",
+    "write_mesh": "mn_onnx.extract.files",
+}
+
+__all__ = [
+    "CheckFailed",
+    "MnOnnxError",
+    "Model",
+    "ModelRefused",
+    "Problem",
+    "Surface",
+    "UsageError",
+    "extract",
+    "load",
+    "read_mesh",
+    "write_mesh",
+]
+
+
+class _CallablePackage(ModuleType):
+    """Makes the package `mn_onnx.extract` callable, since the library's main function has the same name."""
+
+    def __call__(self, *args: Any, **options: Any) -> Any:
+        from mn_onnx.extraction import extract
+
+        return extract(*args, **options)
+
+
+_extract_package.__class__ = _CallablePackage
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOMES:
+        raise AttributeError(f"module 'mn_onnx' has no attribute {name!r}")
+    value = getattr(import_module(_HOMES[name]), name)
+    globals()[name] = value
+    return value

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import gzip
+import io
 import zlib
 
 import onnx
 from google.protobuf import json_format, text_format
-from google.protobuf.message import DecodeError
+from google.protobuf.descriptor import FieldDescriptor
+from google.protobuf.message import DecodeError, Message
 
 from mn_onnx.errors import ModelRefused, Problem
 
@@ -61,15 +63,14 @@ def _refused(name: str, reason: str, remedy: str) -> ModelRefused:
 
 
 def _decompress(data: bytes, name: str) -> bytes:
-    decompressor = zlib.decompressobj(wbits=31)
     try:
-        head = decompressor.decompress(data, PROTOBUF_LIMIT)
-        if decompressor.unconsumed_tail:
-            raise _refused(name, "the gzip file holds more than 2 GiB", "pass the uncompressed model")
-        # A file may hold several gzip members; the size of the first was checked above.
-        return head if not decompressor.unused_data else gzip.decompress(data)
+        with gzip.GzipFile(fileobj=io.BytesIO(data)) as file:
+            content = file.read(PROTOBUF_LIMIT + 1)
     except (zlib.error, EOFError, OSError) as error:
         raise _refused(name, f"the gzip file is damaged ({error})", "compress or download it again") from error
+    if len(content) > PROTOBUF_LIMIT:
+        raise _refused(name, "the gzip file holds more than 2 GiB", "store the weights as external data")
+    return content
 
 
 def _as_text(data: bytes) -> str | None:
@@ -102,10 +103,24 @@ def _decode_binary(data: bytes, name: str) -> onnx.ModelProto:
             name, "the file has more than 2 GiB, the limit of protobuf", "store the weights as external data"
         )
     try:
-        return onnx.ModelProto.FromString(data)
+        model = onnx.ModelProto.FromString(data)
     except DecodeError as error:
         reason = f"the file is damaged, cut off, or not an ONNX model ({_first_line(error)})"
         raise _refused(name, reason, "export or download it again") from error
+    if not _is_text_valid(model):
+        raise _refused(name, "the file is damaged: a name in it is not UTF-8 text", "export or download it again")
+    return model
+
+
+def _is_text_valid(message: Message) -> bool:
+    """Whether all text fields are UTF-8; protobuf hands out those that are not as bytes."""
+    for field, value in message.ListFields():
+        parts = [value] if isinstance(value, (str, bytes, Message)) else value
+        if field.type == FieldDescriptor.TYPE_STRING and any(isinstance(part, bytes) for part in parts):
+            return False
+        if field.type == FieldDescriptor.TYPE_MESSAGE and not all(_is_text_valid(part) for part in parts):
+            return False
+    return True
 
 
 def _first_line(error: Exception) -> str:

@@ -5,7 +5,7 @@
     mn-onnx extract bunny.onnx -o bunny-exact.ply
 
 Reads what trimesh reads. The mesh is centred and scaled so that its longest side is 1.8 of the box [-1, 1]^3; the
-metadata of the exported model say how (``centre``, ``scale``: network coordinates = (mesh coordinates - centre) * scale).
+metadata of the exported model say how: network coordinates are (mesh coordinates - ``centre``) * ``scale``.
 Signs come from fast winding numbers (Barill et al. 2018, through libigl), so small holes in the mesh do no harm.
 """
 

@@ -1,0 +1,154 @@
+"""The command line: arguments, exit codes, and nothing else, so that it starts fast. `mn_onnx.commands` does the work.
+
+Exit codes: 0 success; 2 wrong usage or a refused model; 3 a check failed or there is no level set; 130 interrupted.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+
+from mn_onnx import __version__
+from mn_onnx.errors import CheckFailed, MnOnnxError
+
+EXIT_USAGE = 2
+EXIT_CHECK = 3
+EXIT_INTERRUPTED = 130
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command line with ``arguments`` (default: those of the process); returns the exit code."""
+    options = build_parser().parse_args(arguments)
+    try:
+        status: int = options.run(options)
+        return status
+    except CheckFailed as error:
+        _complain(str(error))
+        return EXIT_CHECK
+    except MnOnnxError as error:
+        _complain(str(error))
+        return EXIT_USAGE
+    except KeyboardInterrupt:
+        _complain("interrupted")
+        return EXIT_INTERRUPTED
+
+
+def _extract(options: argparse.Namespace) -> int:
+    from mn_onnx.commands import run_extract
+
+    return run_extract(options)
+
+
+def _inspect(options: argparse.Namespace) -> int:
+    from mn_onnx.commands import run_inspect
+
+    return run_inspect(options)
+
+
+def _verify(options: argparse.Namespace) -> int:
+    from mn_onnx.commands import run_verify
+
+    return run_verify(options)
+
+
+def _complain(message: str) -> None:
+    print(f"mn-onnx: {message}", file=sys.stderr)
+
+
+def build_parser() -> argparse.ArgumentParser:
+    """The parser of all commands; ``options.run`` is the function that carries the command out."""
+    parser = argparse.ArgumentParser(
+        prog="mn-onnx",
+        description="Exact level sets of networks exported to ONNX, as welded polygon meshes.",
+        epilog="Exit codes: 0 ok, 2 wrong usage or refused model, 3 failed check or empty level set, 130 interrupted.",
+    )
+    parser.add_argument("--version", action="version", version=f"mn-onnx {__version__}")
+    commands = parser.add_subparsers(required=True, metavar="COMMAND")
+    _add_extract(commands)
+    _add_inspect(commands)
+    _add_verify(commands)
+    return parser
+
+
+def _add_extract(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    parser = commands.add_parser(
+        "extract",
+        help="write the level set of a model as a mesh file",
+        description="Extract {x in box | f(x) = level} exactly, check it, and write it. The format follows the ending "
+        "of MESH: .ply .obj .off hold polygons, .stl .glb .3mf triangles.",
+    )
+    parser.set_defaults(run=_extract)
+    _add_model(parser)
+    parser.add_argument("-o", "--mesh", required=True, metavar="MESH", help="mesh file to write")
+    parser.add_argument(
+        "--triangulate", action="store_true", help="write triangles where the format could hold polygons"
+    )
+    parser.add_argument("--float64", action="store_true", help="write coordinates in double precision (.ply)")
+    parser.add_argument("--report", metavar="FILE.json", help="write counts, checks, times and versions as JSON")
+    parser.add_argument("--no-check", action="store_true", help="write the mesh without checks against onnxruntime")
+    parser.add_argument("--quiet", action="store_true", help="print nothing but errors")
+    _add_threads(parser)
+
+
+def _add_inspect(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    parser = commands.add_parser(
+        "inspect",
+        help="say what a model is, before any work",
+        description="Exact or not, units, layers, knots, the certified range of the output on the box; or all reasons "
+        "why the model would be refused.",
+    )
+    parser.set_defaults(run=_inspect)
+    _add_model(parser)
+    parser.add_argument(
+        "--stage", choices=("imported", "canonical"), help="print the network as it is after this stage"
+    )
+    parser.add_argument("--json", action="store_true", help="print JSON")
+
+
+def _add_verify(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    parser = commands.add_parser(
+        "verify",
+        help="check a mesh file against a model",
+        description="Measure the invariants of any mesh file, and |f - level| on it, in float64 and by onnxruntime.",
+    )
+    parser.set_defaults(run=_verify)
+    parser.add_argument("mesh", metavar="MESH", help="mesh file to check")
+    _add_model(parser)
+    parser.add_argument(
+        "--tolerance",
+        type=float,
+        metavar="T",
+        help="largest |f - level| to accept (default: what the rounding of the stored coordinates explains)",
+    )
+    parser.add_argument("--json", action="store_true", help="print JSON")
+    _add_threads(parser)
+
+
+def _add_model(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("model", metavar="MODEL", help="ONNX file")
+    field = parser.add_argument_group("the field")
+    field.add_argument("--level", type=float, default=0.0, metavar="L", help="value of the level set (default 0)")
+    field.add_argument(
+        "--bounds",
+        type=float,
+        nargs="+",
+        metavar="B",
+        help="box: LOW HIGH for all axes, or LOW HIGH of each axis in turn (default: the model's metadata, else -1 1)",
+    )
+    field.add_argument("--output", metavar="NAME[:CHANNEL]", help="output of the model, and which of its values")
+    field.add_argument(
+        "--bind",
+        action="append",
+        default=[],
+        metavar="NAME=VALUE",
+        help="fix another input: a number, numbers with commas, or a .npy file; repeatable",
+    )
+    field.add_argument("--coordinates", metavar="I,J,K", help="columns of the input that are the point, if it has more")
+    smooth = parser.add_argument_group("smooth activations")
+    smooth.add_argument("--surrogate-tol", type=float, metavar="T", help="error allowed per piecewise-linear surrogate")
+    smooth.add_argument("--knots-per-period", type=int, metavar="N", help="knots per period of sines and cosines")
+
+
+def _add_threads(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--threads", type=int, metavar="N", help="threads to use (default: all cores)")
