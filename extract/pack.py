@@ -28,33 +28,13 @@ from mn_onnx.extract.kernels.memory import (
     system_floats,
     system_ints,
 )
+from mn_onnx.extract.kernels.records import Tables
 from mn_onnx.ir.network import Network
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
 DIMENSIONS = 3
-
-
-class Tables(NamedTuple):
-    """The units' knot tables and the random words of the vertex keys.
-
-    Knots of all units lie one after the other; unit ``u`` owns ``first_knot[u]:first_knot[u + 1]`` (int64 [units + 1]).
-    Output ``k`` of unit ``u`` has its pieces at ``first_piece[u] + k * (knots of u + 1)``. The plane of a knot has the
-    knot's index; box face ``f`` is plane ``n_knots + f``. ``state_hash`` (int64 [n_knots + units, 2]) has a word pair per
-    unit and state, ``tag_hash`` (int64 [2 * n_knots + 12, 2]) what turns the hash of a cell's states into that of a
-    vertex on the tagged plane. ``extent`` bounds the coordinates' magnitude on the box (at least 1).
-    """
-
-    first_knot: Integers
-    knots: Floats
-    first_piece: Integers
-    slopes: Floats
-    intercepts: Floats
-    state_hash: Integers
-    tag_hash: Integers
-    n_knots: int
-    extent: float
 
 
 class Packed(NamedTuple):

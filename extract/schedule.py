@@ -11,7 +11,6 @@ import os
 import threading
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,6 +27,7 @@ from mn_onnx.extract.kernels.memory import (
     SYS_INTS,
     X_REGIONS,
 )
+from mn_onnx.extract.kernels.records import OutputArrays, WorkerArrays
 from mn_onnx.extract.pack import Packed, pack
 from mn_onnx.extract.soup import PolygonSoup
 from mn_onnx.ir.network import Network
@@ -38,29 +38,6 @@ Integers = NDArray[np.int64]
 LEAF_CHOICES = 8
 BUDGET = 20_000_000  # weights read between two looks at the world: some tens of milliseconds
 BUFFER_CORNERS = 1 << 16
-
-
-class WorkerArrays(NamedTuple):
-    """One worker's memory; see `kernels.memory`."""
-
-    F: Floats
-    I: Integers  # noqa: E741
-    X: Floats
-    J: Integers
-    control: Integers
-    stack: Integers
-    slot_of_tag: Integers
-
-
-class OutputArrays(NamedTuple):
-    """One worker's output buffers; ``counts`` holds the numbers of polygons and corners in them."""
-
-    counts: Integers
-    sizes: NDArray[np.int32]
-    gradients: Floats
-    positions: Floats
-    keys: Integers
-    box_faces: NDArray[np.int8]
 
 
 @dataclass
@@ -76,6 +53,7 @@ class TraversalStatistics:
     deepest: int = 0
     subtrees: int = 0
     threads: int = 1
+    profile: Integers | None = None
 
 
 @dataclass(frozen=True)
@@ -322,6 +300,7 @@ def _statistics(workers: list[_Worker], pool: _Pool) -> TraversalStatistics:
         deepest=max(int(worker.control[kernel.DEEPEST]) for worker in workers),
         subtrees=pool.subtrees,
         threads=len(workers),
+        profile=sum(w.control[kernel.PROFILE :] for w in workers).reshape(2, -1),
     )
 
 

@@ -257,8 +257,8 @@ def carry_states(I, J, M, tables, system, folded):
         unit = I[row_unit + r]
         if unit >= 0 and J[STATE_LOW * M + r] == J[STATE_HIGH * M + r]:
             state = tables.first_knot[unit] + unit + J[STATE_LOW * M + r]
-            hash0 ^= tables.state_hash[state, 0]
-            hash1 ^= tables.state_hash[state, 1]
+            hash0 ^= tables.state_hash[2 * state]
+            hash1 ^= tables.state_hash[2 * state + 1]
     I[folded + SYS_HASH], I[folded + SYS_HASH + 1] = hash0, hash1
     for q in range(I[folded + SYS_ROWS]):
         r = J[KEPT_ROWS * M + q]

@@ -4,7 +4,7 @@ LLVM's loop vectoriser guards every short loop over arrays with run-time alias c
 to thirty steps gain. Here the vector operations are written out, so that a kernel's inner loop is exactly its loads and
 fused multiply-adds. Every machine LLVM knows can run them; one without 256-bit registers splits them.
 
-`load` and `store` are unaligned and unchecked: callers pad arrays to a multiple of `WIDTH`.
+`load` and `store` are unaligned and unchecked: callers pad to a multiple of `WIDTH`.
 """
 
 from __future__ import annotations
@@ -37,9 +37,8 @@ class _LanesModel(models.PrimitiveModel):
         super().__init__(manager, numba_type, _VECTOR)
 
 
-def _element_pointer(context: Any, builder: Any, array_type: Any, array: Any, index: Any) -> Any:
-    data = context.make_array(array_type)(context, builder, array).data
-    return builder.bitcast(builder.gep(data, [index]), _VECTOR.as_pointer())
+def _vector_pointer(builder: Any, pointer: Any, index: Any) -> Any:
+    return builder.bitcast(builder.gep(pointer, [index]), _VECTOR.as_pointer())
 
 
 def _call(builder: Any, name: str, arguments: list[Any]) -> Any:
@@ -49,26 +48,38 @@ def _call(builder: Any, name: str, arguments: list[Any]) -> Any:
 
 
 @intrinsic
-def load(typing_context: Any, array: Any, index: Any) -> Any:
-    """``array[index : index + WIDTH]``."""
+def pointer(typing_context: Any, array: Any) -> Any:
+    """The address of a C-contiguous array's first element; index it as a flat array.
+
+    An index through a pointer is one instruction, where an array's handles negative indices; and passing a pointer on
+    costs neither the array's seven words nor its reference count. The caller keeps the array alive.
+    """
 
     def code(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        pointer = _element_pointer(context, builder, signature.args[0], *arguments)
-        return builder.load(pointer, align=8)
+        return context.make_array(signature.args[0])(context, builder, arguments[0]).data
 
-    return lanes(array, types.int64), code
+    return types.CPointer(array.dtype)(array), code
 
 
 @intrinsic
-def store(typing_context: Any, array: Any, index: Any, value: Any) -> Any:
-    """``array[index : index + WIDTH] = value``."""
+def load(typing_context: Any, source: Any, index: Any) -> Any:
+    """``source[index : index + WIDTH]`` through a pointer."""
 
     def code(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        pointer = _element_pointer(context, builder, signature.args[0], arguments[0], arguments[1])
-        builder.store(arguments[2], pointer, align=8)
+        return builder.load(_vector_pointer(builder, *arguments), align=8)
+
+    return lanes(source, types.int64), code
+
+
+@intrinsic
+def store(typing_context: Any, target: Any, index: Any, value: Any) -> Any:
+    """``target[index : index + WIDTH] = value`` through a pointer."""
+
+    def code(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        builder.store(arguments[2], _vector_pointer(builder, arguments[0], arguments[1]), align=8)
         return context.get_dummy_value()
 
-    return types.none(array, types.int64, lanes), code
+    return types.none(target, types.int64, lanes), code
 
 
 @intrinsic
@@ -153,3 +164,14 @@ def lane(typing_context: Any, value: Any, index: Any) -> Any:
         return builder.extract_element(arguments[0], builder.trunc(arguments[1], ir.IntType(32)))
 
     return types.float64(lanes, types.int64), code
+
+
+@intrinsic
+def cycles(typing_context: Any) -> Any:
+    """The machine's cycle counter, for profiles."""
+
+    def code(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        counter = ir.FunctionType(ir.IntType(64), [])
+        return builder.call(cgutils.get_or_insert_function(builder.module, counter, "llvm.readcyclecounter"), [])
+
+    return types.int64(), code

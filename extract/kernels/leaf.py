@@ -48,14 +48,14 @@ def emit_polygon(X, J, M, output, tables, count, polygon, tags, hash0, hash1, gr
         before = J[tags * M + (j - 1 if j > 0 else count - 1)]
         after = J[tags * M + j]
         for axis in range(3):
-            output.positions[corner + j, axis] = X[(polygon + axis) * M + j]
-        output.keys[corner + j, 0] = hash0 ^ tables.tag_hash[before, 0] ^ tables.tag_hash[after, 0]
-        output.keys[corner + j, 1] = hash1 ^ tables.tag_hash[before, 1] ^ tables.tag_hash[after, 1]
+            output.positions[3 * (corner + j) + axis] = X[(polygon + axis) * M + j]
+        output.keys[2 * (corner + j)] = hash0 ^ tables.tag_hash[2 * before] ^ tables.tag_hash[2 * after]
+        output.keys[2 * (corner + j) + 1] = hash1 ^ tables.tag_hash[2 * before + 1] ^ tables.tag_hash[2 * after + 1]
         output.box_faces[corner + j] = (after >> 1) - tables.n_knots if after >= 2 * tables.n_knots else -1
     face = output.counts[0]
     output.sizes[face] = count
     for axis in range(3):
-        output.gradients[face, axis] = X[gradient + axis]
+        output.gradients[3 * face + axis] = X[gradient + axis]
     output.counts[0] = face + 1
     output.counts[1] = corner + count
 
@@ -114,9 +114,7 @@ def emit_choice(F, I, X, J, M, output, tables, slot_of_tag, cell, cell_rows, sys
     row_unit = system + SYS_HEADER + I[system + SYS_LEVELS] + 1
     gradient = FORMS * M + 4 * rows
     substitute_output(F, I, X, J, M, system, floats, tables, gradient)
-    evaluate_affine(
-        F, I, X, M, cell, OUT_VALUES, X[gradient], X[gradient + 1], X[gradient + 2], X[gradient + 3]
-    )
+    evaluate_affine(F, I, X, M, cell, OUT_VALUES, X[gradient], X[gradient + 1], X[gradient + 2], X[gradient + 3])
     low, high = value_range(X, M, OUT_VALUES, I[cell + CELL_CAPACITY])
     if low >= 0.0 or high < 0.0:
         return 0
@@ -131,8 +129,8 @@ def emit_choice(F, I, X, J, M, output, tables, slot_of_tag, cell, cell_rows, sys
             continue
         knot = tables.first_knot[unit]
         state = J[CHOICE * M + r]
-        hash0 ^= tables.state_hash[knot + unit + state, 0]
-        hash1 ^= tables.state_hash[knot + unit + state, 1]
+        hash0 ^= tables.state_hash[2 * (knot + unit + state)]
+        hash1 ^= tables.state_hash[2 * (knot + unit + state) + 1]
         at = FORMS * M + 4 * r
         for side in range(2):
             # side 1: the state's lower knot, to its right; side 0: its upper knot, to its left.
@@ -142,7 +140,7 @@ def emit_choice(F, I, X, J, M, output, tables, slot_of_tag, cell, cell_rows, sys
             constant = X[at + 3] - tables.knots[plane]
             count = clip_polygon(
                 X, J, M, count, polygon, tags, other, other_tags,
-                X[at], X[at + 1], X[at + 2], constant, side, 2 * plane + side,
+                X[at], X[at + 1], X[at + 2], constant, side, 2 * plane + side, gradient,
             )  # fmt: skip
             if count == 0:
                 return 0

@@ -8,10 +8,13 @@ output buffer might not have room for the next cell, or when it is told to stop.
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 from numba import njit
 
 from mn_onnx.extract.kernels.bound import MARGIN, bound_output, bound_units, value_range
 from mn_onnx.extract.kernels.fold import carry_states, fold, folding_floats
+from mn_onnx.extract.kernels.lanes import cycles, pointer
 from mn_onnx.extract.kernels.leaf import emit_leaf
 from mn_onnx.extract.kernels.memory import (
     CELL_CAPACITY,
@@ -46,32 +49,78 @@ from mn_onnx.extract.kernels.memory import (
     system_ints,
 )
 from mn_onnx.extract.kernels.polytope import evaluate_affine, find_cut_edges, link_cut_edges, write_half
+from mn_onnx.extract.kernels.records import OutputArrays, Tables
 
 DONE, BUDGET_USED, ARENA_FULL, SCRATCH_FULL, OUTPUT_FULL, STACK_FULL, STOPPED = 0, 1, 2, 3, 4, 5, 6
 
 # Entries of the control array.
-(STACK_BOTTOM, STACK_TOP, TOP_F, TOP_I, STOP, LEAF_CHOICES, NODES, PRUNED, LEAVES, FOLDS, WORK, NEED_F, NEED_I) = range(13)
-(CONSTANT_CELLS, DEEPEST, NEED_CORNERS, NEED_POLYGONS, CHILDREN_PRUNED, CONTROL_SIZE) = range(13, 19)
+(STACK_BOTTOM, STACK_TOP, TOP_F, TOP_I, STOP, LEAF_CHOICES, NODES, PRUNED, LEAVES, FOLDS, WORK, NEED_F, NEED_I) = range(
+    13
+)
+(CONSTANT_CELLS, DEEPEST, NEED_CORNERS, NEED_POLYGONS, CHILDREN_PRUNED, PROFILE) = range(13, 19)
+# Per power of two of unstable units: nodes, cycles.
+PROFILE_BINS = 16
+CONTROL_SIZE = PROFILE + 2 * PROFILE_BINS
+
+
+class Room(NamedTuple):
+    """Sizes of a worker's arrays: arenas, scratch regions, stack, and output buffers in polygons and corners."""
+
+    floats: int
+    integers: int
+    scratch: int
+    stack: int
+    polygons: int
+    corners: int
 
 
 @njit(cache=True)
-def missing_room(F, I, M, control, stack, output, cell, rows, cols, levels):
+def point_at_tables(tables):
+    """The tables with pointers in place of arrays."""
+    return Tables(
+        pointer(tables.first_knot),
+        pointer(tables.knots),
+        pointer(tables.first_piece),
+        pointer(tables.slopes),
+        pointer(tables.intercepts),
+        pointer(tables.state_hash),
+        pointer(tables.tag_hash),
+        tables.n_knots,
+        tables.extent,
+    )
+
+
+@njit(cache=True)
+def point_at_output(output):
+    """The output buffers with pointers in place of arrays."""
+    return OutputArrays(
+        pointer(output.counts),
+        pointer(output.sizes),
+        pointer(output.gradients),
+        pointer(output.positions),
+        pointer(output.keys),
+        pointer(output.box_faces),
+    )
+
+
+@njit(cache=True)
+def missing_room(I, control, room, counts, cell, rows, cols, levels):
     """The status to return if the next cell might not fit anywhere, else DONE; sets the NEED_* entries."""
     vertices = I[cell + CELL_VERTICES]
     most = 2 * vertices + 8
     choices = control[LEAF_CHOICES]
     need_f = control[TOP_F] + folding_floats(rows, cols) + 6 * padded(most)
     need_i = control[TOP_I] + system_ints(rows, cols, levels) + 2 * cell_ints(rows, most)
-    if need_f > F.size or need_i > I.size:
+    if need_f > room.floats or need_i > room.integers:
         control[NEED_F], control[NEED_I] = need_f, need_i
         return ARENA_FULL
-    if most + 2 * choices > M:
+    if most + 2 * choices > room.scratch:
         control[NEED_I] = most + 2 * choices
         return SCRATCH_FULL
-    if control[STACK_TOP] + 2 > stack.size:
+    if control[STACK_TOP] + 2 > room.stack:
         return STACK_FULL
     polygons, corners = choices, choices * (vertices + 2 * choices + 8)
-    if output.counts[0] + polygons > output.sizes.size or output.counts[1] + corners > output.keys.shape[0]:
+    if counts[0] + polygons > room.polygons or counts[1] + corners > room.corners:
         control[NEED_POLYGONS], control[NEED_CORNERS] = polygons, corners
         return OUTPUT_FULL
     return DONE
@@ -158,7 +207,9 @@ def push_half(F, I, X, J, M, control, stack, cell, cell_rows, system, floats, co
 
 
 @njit(cache=True)
-def split_cell(F, I, X, J, M, control, stack, tables, slot_of_tag, cell, cell_rows, system, floats, row, form, knot, slack):
+def split_cell(
+    F, I, X, J, M, control, stack, tables, slot_of_tag, cell, cell_rows, system, floats, row, form, knot, slack
+):
     """Push both halves of a cell, less those that the output's centre and ``slack`` exclude.
 
     ``form`` is the row that the splitting pre-activation has in X, ``row`` the one it has in ``system``.
@@ -232,12 +283,15 @@ def visit(F, I, X, J, M, control, stack, output, tables, slot_of_tag, cell):
 def march(worker, tables, output, budget):
     """Visit cells until the worker's stack is empty; returns one of the status codes of this module.
 
-    ``worker``: `schedule.WorkerArrays`; ``tables``: `pack.Tables`; ``output``: `schedule.OutputArrays`; ``budget``: about
+    ``worker``: `WorkerArrays`; ``tables``: `Tables`; ``output``: `OutputArrays`; ``budget``: about
     how many weights to read before returning BUDGET_USED.
     """
-    F, I, X, J = worker.F, worker.I, worker.X, worker.J
-    control, stack, slot_of_tag = worker.control, worker.stack, worker.slot_of_tag
-    M = X.size // X_REGIONS
+    M = worker.X.size // X_REGIONS
+    F, I, X, J = pointer(worker.F), pointer(worker.I), pointer(worker.X), pointer(worker.J)
+    control, stack, slot_of_tag = pointer(worker.control), pointer(worker.stack), pointer(worker.slot_of_tag)
+    knots = point_at_tables(tables)
+    buffers = point_at_output(output)
+    room = Room(worker.F.size, worker.I.size, M, worker.stack.size, output.sizes.size, output.box_faces.size)
     used = 0
     while control[STACK_TOP] > control[STACK_BOTTOM]:
         if control[STOP] != 0:
@@ -248,12 +302,20 @@ def march(worker, tables, output, budget):
         system = I[cell + CELL_SYSTEM_I]
         rows, cols, levels = I[system + SYS_ROWS], I[system + SYS_COLS], I[system + SYS_LEVELS]
         control[TOP_F], control[TOP_I] = I[cell + CELL_END_F], I[cell + CELL_END_I]
-        status = missing_room(F, I, M, control, stack, output, cell, rows, cols, levels)
+        status = missing_room(I, control, room, output.counts, cell, rows, cols, levels)
         if status != DONE:
             return status
         control[STACK_TOP] -= 1
         control[NODES] += 1
         control[DEEPEST] = max(control[DEEPEST], I[cell + CELL_DEPTH])
         used += 200 + rows * cols
-        visit(F, I, X, J, M, control, stack, output, tables, slot_of_tag, cell)
+        before = cycles()
+        visit(F, I, X, J, M, control, stack, buffers, knots, slot_of_tag, cell)
+        bin_ = 0
+        units = I[system + SYS_UNITS]
+        while units > 0:
+            bin_ += 1
+            units >>= 1
+        control[PROFILE + bin_] += 1
+        control[PROFILE + PROFILE_BINS + bin_] += cycles() - before
     return DONE

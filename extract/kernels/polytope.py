@@ -31,6 +31,9 @@ from mn_onnx.extract.kernels.memory import (
 )
 
 
+TINY = 1e-300
+
+
 @njit(cache=True)
 def evaluate_affine(F, I, X, M, cell, region, a0, a1, a2, a3):
     """``X[region]`` = a . x + a3 at the cell's vertices (and at its padding, which repeats the last one)."""
@@ -172,16 +175,21 @@ def read_cut_polygon(X, J, M, count, polygon, tags):
 
 
 @njit(cache=True)
-def clip_polygon(X, J, M, count, polygon, tags, result, result_tags, a0, a1, a2, a3, side, tag):
+def clip_polygon(X, J, M, count, polygon, tags, result, result_tags, a0, a1, a2, a3, side, tag, gradient):
     """Keep the part of a convex polygon where a . x + a3 is negative (side 0) or not (side 1).
 
-    The new edge gets ``tag``. Returns the number of corners of the result, 0 where nothing is left.
+    A corner exactly on the plane goes to the side where f (``X[gradient : gradient + 3]``) falls: the piece on the other
+    side has no point with f < 0 there. The new edge gets ``tag``. Returns the number of corners of the result, 0 where
+    nothing is left.
     """
+    rises = a0 * X[gradient] + a1 * X[gradient + 1] + a2 * X[gradient + 2] > 0.0
     px, py, pz = polygon * M, (polygon + 1) * M, (polygon + 2) * M
     values = POLY_VALUES * M
     inside = 0
     for j in range(count):
         value = a0 * X[px + j] + (a1 * X[py + j] + (a2 * X[pz + j] + a3))
+        if value == 0.0 and rises:
+            value = -TINY
         X[values + j] = value
         if (value >= 0.0) == (side == 1):
             inside += 1
