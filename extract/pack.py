@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 from mn_onnx.extract.kernels.lanes import WIDTH
 from mn_onnx.extract.kernels.memory import (
     CELL_CAPACITY,
-    CELL_DEPTH,
     CELL_END_F,
     CELL_END_I,
     CELL_FLOATS,
@@ -42,7 +41,7 @@ class Packed(NamedTuple):
 
     tables: Tables
     F: Floats
-    I: Integers  # noqa: E741
+    N: Integers
     root: int
     rows: int
     cols: int
@@ -151,27 +150,26 @@ def _pack_system(network: Network, order: Integers) -> tuple[Floats, Integers]:
     out_affine[3] = network.output.bias
     out_weights[col_of_variable[network.output.columns[~inside]]] = network.output.weights[~inside]
 
-    begin, end = _row_extents(weights)
+    begin = np.repeat(np.array(starts, np.int64)[1:], np.diff(starts))[col_row]
+    end = np.maximum(_last_rows(weights), begin)
     header = np.zeros(SYS_HEADER, np.int64)
     header[SYS_ROWS], header[SYS_COLS], header[SYS_LEVELS] = rows, cols, n_levels
     header[SYS_FLOATS], header[SYS_INTS] = system_floats(rows, cols), system_ints(rows, cols, n_levels)
     header[SYS_UNITS] = order.size
     integers = np.concatenate([header, np.array(starts, np.int64), row_unit, row_col, col_row, begin, end])
     floats = np.concatenate([affine.reshape(-1), weights.reshape(-1), out_weights, out_affine])
-    assert integers.size == header[SYS_INTS] and floats.size == header[SYS_FLOATS]
+    assert (integers.size, floats.size) == (header[SYS_INTS], header[SYS_FLOATS])
     return floats, integers
 
 
-def _row_extents(weights: Floats) -> tuple[Integers, Integers]:
-    """First and one past the last row that each column has weights on, widened to the lane width."""
+def _last_rows(weights: Floats) -> Integers:
+    """One past the last row that each column has weights on, rounded up to the lane width."""
     cols, rows = weights.shape
     if rows == 0:
-        return np.zeros(cols, np.int64), np.zeros(cols, np.int64)
+        return np.zeros(cols, np.int64)
     used = weights != 0.0
-    any_used = used.any(axis=1)
-    begin = np.where(any_used, used.argmax(axis=1), rows) // WIDTH * WIDTH
-    end = np.where(any_used, rows - used[:, ::-1].argmax(axis=1), 0)
-    return begin, np.maximum(-(-end // WIDTH) * WIDTH, begin)
+    last = np.where(used.any(axis=1), rows - used[:, ::-1].argmax(axis=1), 0)
+    return -(-last // WIDTH) * WIDTH
 
 
 def _pack_box(
@@ -200,8 +198,7 @@ def _pack_box(
     header[CELL_SYSTEM_F], header[CELL_SYSTEM_I] = 0, 0
     header[CELL_VERTICES] = header[CELL_CAPACITY] = 8
     header[CELL_FLOATS] = base_f
-    header[CELL_DEPTH] = 0
     integers = np.concatenate([header, np.zeros_like(high), high, tags.reshape(-1), neighbours.reshape(-1)])
     header_end_f, header_end_i = base_f + 24, base_i + integers.size
     integers[CELL_END_F], integers[CELL_END_I] = header_end_f, header_end_i
-    return np.ascontiguousarray(positions.T).reshape(-1), integers.astype(np.int64)
+    return positions.T.reshape(-1), integers.astype(np.int64)

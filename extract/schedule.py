@@ -79,7 +79,7 @@ class _Task:
     """A subtree: a system and a cell as arena contents, and the polygons found in it so far."""
 
     F: Floats
-    I: Integers  # noqa: E741
+    N: Integers
     root: int
     volume: float
     chunks: list[_Chunk] = field(default_factory=list)
@@ -93,7 +93,7 @@ class _Worker:
         largest = max(packed.rows, packed.cols) + 8
         self.packed = packed
         self.F = np.empty(max(1 << 16, 2 * packed.F.size))
-        self.I = np.empty(max(1 << 16, 2 * packed.I.size), np.int64)
+        self.N = np.empty(max(1 << 16, 2 * packed.N.size), np.int64)
         self.control = np.zeros(kernel.CONTROL_SIZE, np.int64)
         self.control[kernel.LEAF_CHOICES] = LEAF_CHOICES
         self.stack = np.zeros(1024, np.int64)
@@ -117,9 +117,9 @@ class _Worker:
         )
 
     def start(self, task: _Task) -> None:
-        self._reserve(2 * task.F.size, 2 * task.I.size)
+        self._reserve(2 * task.F.size, 2 * task.N.size)
         self.F[: task.F.size] = task.F
-        self.I[: task.I.size] = task.I
+        self.N[: task.N.size] = task.N
         self.stack[0] = task.root
         self.control[kernel.STACK_BOTTOM] = 0
         self.control[kernel.STACK_TOP] = 1
@@ -129,10 +129,10 @@ class _Worker:
             grown = np.empty(floats + floats // 2)
             grown[: self.F.size] = self.F
             self.F = grown
-        if integers > self.I.size:
+        if integers > self.N.size:
             grown_i = np.empty(integers + integers // 2, np.int64)
-            grown_i[: self.I.size] = self.I
-            self.I = grown_i
+            grown_i[: self.N.size] = self.N
+            self.N = grown_i
 
     def flush(self, task: _Task) -> None:
         """Move the polygons in the buffers to the task."""
@@ -154,7 +154,7 @@ class _Worker:
     def run(self, task: _Task, budget: int) -> bool:
         """Work on the task for about ``budget``; True when it is finished or the worker was told to stop."""
         while True:
-            arrays = WorkerArrays(self.F, self.I, self.X, self.J, self.control, self.stack, self.slot_of_tag)
+            arrays = WorkerArrays(self.F, self.N, self.X, self.J, self.control, self.stack, self.slot_of_tag)
             status = kernel.march(arrays, self.packed.tables, self.output, budget)
             if status in (kernel.DONE, kernel.STOPPED):
                 self.flush(task)
@@ -180,16 +180,16 @@ class _Worker:
             return None
         cell = int(self.stack[bottom])
         self.control[kernel.STACK_BOTTOM] += 1
-        header = self.I[cell : cell + CELL_END_I + 1]
+        header = self.N[cell : cell + CELL_END_I + 1]
         system_f, system_i = int(header[CELL_SYSTEM_F]), int(header[CELL_SYSTEM_I])
-        floats, integers = int(self.I[system_i + SYS_FLOATS]), int(self.I[system_i + SYS_INTS])
+        floats, integers = int(self.N[system_i + SYS_FLOATS]), int(self.N[system_i + SYS_INTS])
         cell_f, end_f, end_i = int(header[CELL_FLOATS]), int(header[CELL_END_F]), int(header[CELL_END_I])
         F = np.concatenate([self.F[system_f : system_f + floats], self.F[cell_f:end_f]])
-        I = np.concatenate([self.I[system_i : system_i + integers], self.I[cell:end_i]])  # noqa: E741
-        I[integers + CELL_SYSTEM_F], I[integers + CELL_SYSTEM_I] = 0, 0
-        I[integers + CELL_FLOATS] = floats
-        I[integers + CELL_END_F], I[integers + CELL_END_I] = F.size, I.size
-        return _Task(F, I, integers, 0.0)
+        N = np.concatenate([self.N[system_i : system_i + integers], self.N[cell:end_i]])
+        N[integers + CELL_SYSTEM_F], N[integers + CELL_SYSTEM_I] = 0, 0
+        N[integers + CELL_FLOATS] = floats
+        N[integers + CELL_END_F], N[integers + CELL_END_I] = F.size, N.size
+        return _Task(F, N, integers, 0.0)
 
 
 class _Pool:
@@ -253,7 +253,7 @@ def traverse(
     count = threads or os.cpu_count() or 1
     if count < 1:
         raise ValueError(f"threads must be at least 1, not {count}")
-    first = _Task(packed.F, packed.I, packed.root, 1.0)
+    first = _Task(packed.F, packed.N, packed.root, 1.0)
     pool = _Pool(first, count)
     workers = [_Worker(packed) for _ in range(count)]
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from numba import njit
 
-from mn_onnx.extract.kernels.lanes import add, fma, lane, larger, load, magnitude, multiply, smaller, splat, store
+from mn_onnx.extract.kernels.lanes import fma, lane, larger, load, magnitude, smaller, splat, store
 from mn_onnx.extract.kernels.memory import (
     CELL_CAPACITY,
     CELL_FLOATS,
@@ -20,7 +20,10 @@ from mn_onnx.extract.kernels.memory import (
     LOW,
     OFFSET,
     OUT_COEF,
+    OUTPUTS,
     RADIUS,
+    READ_AT,
+    READ_COLS,
     SLOPE,
     STATE_HIGH,
     STATE_LOW,
@@ -35,12 +38,12 @@ from mn_onnx.extract.kernels.memory import (
 MARGIN = 2.0**-40
 
 
-@njit(cache=True)
-def row_extremes(F, I, X, M, cell, begin, end):
+@njit(cache=True, error_model="numpy")
+def row_extremes(F, N, X, M, cell, begin, end):
     """LOW and HIGH of rows ``begin:end`` (multiples of the lane width) over the cell's vertices."""
-    n = I[cell + CELL_VERTICES]
-    x = I[cell + CELL_FLOATS]
-    capacity = I[cell + CELL_CAPACITY]
+    n = N[cell + CELL_VERTICES]
+    x = N[cell + CELL_FLOATS]
+    capacity = N[cell + CELL_CAPACITY]
     y, z = x + capacity, x + 2 * capacity
     for r in range(begin, end, 4):
         c0, c1, c2, c3 = load(X, r), load(X, M + r), load(X, 2 * M + r), load(X, 3 * M + r)
@@ -54,7 +57,7 @@ def row_extremes(F, I, X, M, cell, begin, end):
         store(X, HIGH * M + r, high)
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def relax_piece_range(knots, slopes, intercepts, knot, piece, first, last, low, high):
     """Chord over [low, high] of a table's pieces ``first..last``: slope, offset, error with |y - slope t - offset| <= error."""
     if first == last:
@@ -71,8 +74,8 @@ def relax_piece_range(knots, slopes, intercepts, knot, piece, first, last, low, 
     return slope, at_low - slope * low + 0.5 * (above + below), 0.5 * (above - below)
 
 
-@njit(cache=True)
-def settle_row(I, X, J, M, tables, cols, r, unit):
+@njit(cache=True, error_model="numpy")
+def settle_row(N, X, J, M, tables, cols, r, unit):
     """Tighten the state range of row ``r`` by its bounds and relax its outputs.
 
     Sets STATE_LOW, STATE_HIGH of the row and SLOPE, OFFSET, ERROR of its columns.
@@ -101,7 +104,7 @@ def settle_row(I, X, J, M, tables, cols, r, unit):
     J[STATE_HIGH * M + r] = last
     X[LOW * M + r] = low
     X[HIGH * M + r] = high
-    begin, end = I[cols + r], I[cols + r + 1]
+    begin, end = N[cols + r], N[cols + r + 1]
     pieces = tables.first_knot[unit + 1] - knot + 1
     piece = tables.first_piece[unit]
     for c in range(begin, end):
@@ -114,64 +117,88 @@ def settle_row(I, X, J, M, tables, cols, r, unit):
         piece += pieces
 
 
-@njit(cache=True)
-def push_column(F, X, M, weights, begin, end, r, slope, offset, error):
-    """Add a column's relaxed output to the centres and radii of the later rows ``begin:end``."""
-    y0, y1, y2 = splat(slope * X[r]), splat(slope * X[M + r]), splat(slope * X[2 * M + r])
-    y3 = splat(slope * X[3 * M + r] + offset)
-    width = splat(abs(slope) * X[RADIUS * M + r] + error)
-    for q in range(begin, end, 4):
-        w = load(F, weights + q)
-        store(X, q, fma(w, y0, load(X, q)))
-        store(X, M + q, fma(w, y1, load(X, M + q)))
-        store(X, 2 * M + q, fma(w, y2, load(X, 2 * M + q)))
-        store(X, 3 * M + q, fma(w, y3, load(X, 3 * M + q)))
-        store(X, RADIUS * M + q, fma(magnitude(w), width, load(X, RADIUS * M + q)))
+@njit(cache=True, error_model="numpy")
+def remember_outputs(N, X, J, M, row_col, rows, r, count):
+    """Append the relaxed outputs of row ``r`` that are not identically zero to the list that later rows read.
+
+    Entry ``p``: J[READ_COLS] the column, J[READ_AT] where its weights begin, and five numbers at ``X[OUTPUTS] + 8 p``:
+    the affine form and the half width of y. Returns the new length of the list.
+    """
+    for c in range(N[row_col + r], N[row_col + r + 1]):
+        slope, offset, error = X[SLOPE * M + c], X[OFFSET * M + c], X[ERROR * M + c]
+        if slope != 0.0 or offset != 0.0 or error != 0.0:
+            J[READ_COLS * M + count] = c
+            J[READ_AT * M + count] = c * rows
+            at = OUTPUTS * M + 8 * count
+            X[at] = slope * X[r]
+            X[at + 1] = slope * X[M + r]
+            X[at + 2] = slope * X[2 * M + r]
+            X[at + 3] = slope * X[3 * M + r] + offset
+            X[at + 4] = abs(slope) * X[RADIUS * M + r] + error
+            count += 1
+    return count
 
 
-@njit(cache=True)
-def bound_units(F, I, X, J, M, tables, cell, system, floats):
+@njit(cache=True, error_model="numpy")
+def read_outputs(F, X, J, M, floats, rows, begin, end, first, count):
+    """Centres and radii of rows ``begin:end``: their affine parts plus what they read of outputs ``first:count``."""
+    weights = floats + 4 * rows
+    outputs = OUTPUTS * M
+    places = READ_AT * M
+    for r in range(begin, end, 4):
+        c0, c1 = load(F, floats + r), load(F, floats + rows + r)
+        c2, c3 = load(F, floats + 2 * rows + r), load(F, floats + 3 * rows + r)
+        radius = splat(0.0)
+        for p in range(first, count):
+            w = load(F, weights + J[places + p] + r)
+            y = outputs + 8 * p
+            c0 = fma(w, splat(X[y]), c0)
+            c1 = fma(w, splat(X[y + 1]), c1)
+            c2 = fma(w, splat(X[y + 2]), c2)
+            c3 = fma(w, splat(X[y + 3]), c3)
+            radius = fma(magnitude(w), splat(X[y + 4]), radius)
+        store(X, r, c0)
+        store(X, M + r, c1)
+        store(X, 2 * M + r, c2)
+        store(X, 3 * M + r, c3)
+        store(X, RADIUS * M + r, radius)
+
+
+@njit(cache=True, error_model="numpy")
+def bound_units(F, N, X, J, M, tables, cell, system, floats):
     """Forward pass: bounds, states and relaxations of all rows of the system over the cell.
 
     Reads the row states in J (STATE_LOW, STATE_HIGH) and narrows them. Returns the number of unstable rows.
     """
-    rows, cols, levels = I[system + SYS_ROWS], I[system + SYS_COLS], I[system + SYS_LEVELS]
+    rows, cols, levels = N[system + SYS_ROWS], N[system + SYS_COLS], N[system + SYS_LEVELS]
     level_start = system + SYS_HEADER
     row_unit = level_start + levels + 1
     row_col = row_unit + rows
-    col_begin = row_col + rows + 1 + cols
-    col_end = col_begin + cols
-    zero = splat(0.0)
-    for r in range(0, rows, 4):
-        store(X, r, load(F, floats + r))
-        store(X, M + r, load(F, floats + rows + r))
-        store(X, 2 * M + r, load(F, floats + 2 * rows + r))
-        store(X, 3 * M + r, load(F, floats + 3 * rows + r))
-        store(X, RADIUS * M + r, zero)
-    unstable = 0
+    col_end = row_col + rows + 1 + 2 * cols
+    unstable, first, count = 0, 0, 0
     for level in range(levels):
-        begin, end = I[level_start + level], I[level_start + level + 1]
-        row_extremes(F, I, X, M, cell, begin, end)
+        begin, end = N[level_start + level], N[level_start + level + 1]
+        # The outputs that no later row reads are at the front: extents only grow with the level.
+        while first < count and N[col_end + J[READ_COLS * M + first]] <= begin:
+            first += 1
+        read_outputs(F, X, J, M, floats, rows, begin, end, first, count)
+        row_extremes(F, N, X, M, cell, begin, end)
         for r in range(begin, end):
-            unit = I[row_unit + r]
+            unit = N[row_unit + r]
             if unit < 0:
                 continue
-            settle_row(I, X, J, M, tables, row_col, r, unit)
+            settle_row(N, X, J, M, tables, row_col, r, unit)
             if J[STATE_LOW * M + r] < J[STATE_HIGH * M + r]:
                 unstable += 1
-            for c in range(I[row_col + r], I[row_col + r + 1]):
-                slope, offset, error = X[SLOPE * M + c], X[OFFSET * M + c], X[ERROR * M + c]
-                if slope != 0.0 or offset != 0.0 or error != 0.0:
-                    weights = floats + 4 * rows + c * rows
-                    push_column(F, X, M, weights, I[col_begin + c], I[col_end + c], r, slope, offset, error)
+            count = remember_outputs(N, X, J, M, row_col, rows, r, count)
     return unstable
 
 
-@njit(cache=True)
-def bound_output(F, I, X, M, system, floats):
+@njit(cache=True, error_model="numpy")
+def bound_output(F, N, X, M, system, floats):
     """Backward pass: the output's linear centre (X[CENTRE_AT], four numbers) and its radius, which is returned."""
-    rows, cols = I[system + SYS_ROWS], I[system + SYS_COLS]
-    row_col = system + SYS_HEADER + I[system + SYS_LEVELS] + 1 + rows
+    rows, cols = N[system + SYS_ROWS], N[system + SYS_COLS]
+    row_col = system + SYS_HEADER + N[system + SYS_LEVELS] + 1 + rows
     col_row = row_col + rows + 1
     col_begin = col_row + cols
     col_end = col_begin + cols
@@ -183,12 +210,12 @@ def bound_output(F, I, X, M, system, floats):
         store(X, multiplier + r, zero)
     radius, constant = 0.0, 0.0
     for c in range(cols - 1, -1, -1):
-        begin, end = I[col_begin + c], I[col_end + c]
+        begin, end = N[col_begin + c], N[col_end + c]
         total = zero
         for q in range(begin, end, 4):
             total = fma(load(X, multiplier + q), load(F, weights + c * rows + q), total)
         coefficient = F[out_weights + c] + ((lane(total, 0) + lane(total, 1)) + (lane(total, 2) + lane(total, 3)))
-        X[multiplier + I[col_row + c]] += coefficient * X[SLOPE * M + c]
+        X[multiplier + N[col_row + c]] += coefficient * X[SLOPE * M + c]
         constant += coefficient * X[OFFSET * M + c]
         radius += abs(coefficient) * X[ERROR * M + c]
     s0, s1, s2, s3 = zero, zero, zero, zero
@@ -207,7 +234,7 @@ def bound_output(F, I, X, M, system, floats):
     return radius
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def value_range(X, M, region, count):
     """Smallest and largest of the first ``count`` (a multiple of the lane width) values of a region."""
     low = load(X, region * M)

@@ -40,7 +40,7 @@ from mn_onnx.extract.kernels.polytope import (
 )
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def emit_polygon(X, J, M, output, tables, count, polygon, tags, hash0, hash1, gradient):
     """Append a polygon to the output buffers; the caller has made sure that they have room."""
     corner = output.counts[1]
@@ -60,20 +60,23 @@ def emit_polygon(X, J, M, output, tables, count, polygon, tags, hash0, hash1, gr
     output.counts[1] = corner + count
 
 
-@njit(cache=True)
-def substitute_row(F, I, X, J, M, system, floats, tables, r, target):
+@njit(cache=True, error_model="numpy")
+def substitute_row(F, N, X, J, M, system, floats, tables, r, target):
     """Affine form of row ``r`` at ``X[target : target + 4]`` under the states chosen for the rows before it."""
-    rows = I[system + SYS_ROWS]
-    row_unit = system + SYS_HEADER + I[system + SYS_LEVELS] + 1
+    rows = N[system + SYS_ROWS]
+    row_unit = system + SYS_HEADER + N[system + SYS_LEVELS] + 1
     row_col = row_unit + rows
+    col_begin = row_col + rows + 1 + N[system + SYS_COLS]
     c0, c1, c2, c3 = F[floats + r], F[floats + rows + r], F[floats + 2 * rows + r], F[floats + 3 * rows + r]
     for q in range(r):
-        for c in range(I[row_col + q], I[row_col + q + 1]):
+        for c in range(N[row_col + q], N[row_col + q + 1]):
+            if N[col_begin + c] > r:
+                break
             w = F[floats + 4 * rows + c * rows + r]
             if w != 0.0:
-                unit = I[row_unit + q]
+                unit = N[row_unit + q]
                 pieces = tables.first_knot[unit + 1] - tables.first_knot[unit] + 1
-                piece = tables.first_piece[unit] + (c - I[row_col + q]) * pieces + J[CHOICE * M + q]
+                piece = tables.first_piece[unit] + (c - N[row_col + q]) * pieces + J[CHOICE * M + q]
                 slope = w * tables.slopes[piece]
                 at = FORMS * M + 4 * q
                 c0 += slope * X[at]
@@ -83,21 +86,21 @@ def substitute_row(F, I, X, J, M, system, floats, tables, r, target):
     X[target], X[target + 1], X[target + 2], X[target + 3] = c0, c1, c2, c3
 
 
-@njit(cache=True)
-def substitute_output(F, I, X, J, M, system, floats, tables, target):
+@njit(cache=True, error_model="numpy")
+def substitute_output(F, N, X, J, M, system, floats, tables, target):
     """Affine form of the output at ``X[target : target + 4]`` under the chosen states of all rows."""
-    rows, cols = I[system + SYS_ROWS], I[system + SYS_COLS]
-    row_unit = system + SYS_HEADER + I[system + SYS_LEVELS] + 1
+    rows, cols = N[system + SYS_ROWS], N[system + SYS_COLS]
+    row_unit = system + SYS_HEADER + N[system + SYS_LEVELS] + 1
     row_col = row_unit + rows
     out_weights = floats + 4 * rows + cols * rows
     out = out_weights + padded(cols)
     c0, c1, c2, c3 = F[out], F[out + 1], F[out + 2], F[out + 3]
     for q in range(rows):
-        for c in range(I[row_col + q], I[row_col + q + 1]):
+        for c in range(N[row_col + q], N[row_col + q + 1]):
             w = F[out_weights + c]
-            unit = I[row_unit + q]
+            unit = N[row_unit + q]
             pieces = tables.first_knot[unit + 1] - tables.first_knot[unit] + 1
-            piece = tables.first_piece[unit] + (c - I[row_col + q]) * pieces + J[CHOICE * M + q]
+            piece = tables.first_piece[unit] + (c - N[row_col + q]) * pieces + J[CHOICE * M + q]
             slope = w * tables.slopes[piece]
             at = FORMS * M + 4 * q
             c0 += slope * X[at]
@@ -107,24 +110,24 @@ def substitute_output(F, I, X, J, M, system, floats, tables, target):
     X[target], X[target + 1], X[target + 2], X[target + 3] = c0, c1, c2, c3
 
 
-@njit(cache=True)
-def emit_choice(F, I, X, J, M, output, tables, slot_of_tag, cell, cell_rows, system, floats):
+@njit(cache=True, error_model="numpy")
+def emit_choice(F, N, X, J, M, output, tables, slot_of_tag, cell, cell_rows, system, floats):
     """Emit the polygon of the chosen states, if the surface has one there. Returns 1 if it does, else 0."""
-    rows = I[system + SYS_ROWS]
-    row_unit = system + SYS_HEADER + I[system + SYS_LEVELS] + 1
+    rows = N[system + SYS_ROWS]
+    row_unit = system + SYS_HEADER + N[system + SYS_LEVELS] + 1
     gradient = FORMS * M + 4 * rows
-    substitute_output(F, I, X, J, M, system, floats, tables, gradient)
-    evaluate_affine(F, I, X, M, cell, OUT_VALUES, X[gradient], X[gradient + 1], X[gradient + 2], X[gradient + 3])
-    low, high = value_range(X, M, OUT_VALUES, I[cell + CELL_CAPACITY])
+    substitute_output(F, N, X, J, M, system, floats, tables, gradient)
+    evaluate_affine(F, N, X, M, cell, OUT_VALUES, X[gradient], X[gradient + 1], X[gradient + 2], X[gradient + 3])
+    low, high = value_range(X, M, OUT_VALUES, N[cell + CELL_CAPACITY])
     if low >= 0.0 or high < 0.0:
         return 0
-    count = find_cut_edges(F, I, X, J, M, cell, cell_rows, OUT_VALUES)
+    count = find_cut_edges(F, N, X, J, M, cell, cell_rows, OUT_VALUES)
     link_cut_edges(J, M, slot_of_tag, count)
     polygon, tags, other, other_tags = POLY_A, TAGS_A, POLY_B, TAGS_B
     read_cut_polygon(X, J, M, count, polygon, tags)
-    hash0, hash1 = I[system + SYS_HASH], I[system + SYS_HASH + 1]
+    hash0, hash1 = N[system + SYS_HASH], N[system + SYS_HASH + 1]
     for r in range(rows):
-        unit = I[row_unit + r]
+        unit = N[row_unit + r]
         if unit < 0:
             continue
         knot = tables.first_knot[unit]
@@ -149,18 +152,18 @@ def emit_choice(F, I, X, J, M, output, tables, slot_of_tag, cell, cell_rows, sys
     return 1
 
 
-@njit(cache=True)
-def open_choice(F, I, X, J, M, tables, cell, system, floats, r):
+@njit(cache=True, error_model="numpy")
+def open_choice(F, N, X, J, M, tables, cell, system, floats, r):
     """Find the states that row ``r`` can take in the cell, given those chosen before, and choose the first."""
-    unit = I[system + SYS_HEADER + I[system + SYS_LEVELS] + 1 + r]
+    unit = N[system + SYS_HEADER + N[system + SYS_LEVELS] + 1 + r]
     if unit < 0:
         J[CHOICE * M + r] = 0
         J[CHOICE_LAST * M + r] = 0
         return
     at = FORMS * M + 4 * r
-    substitute_row(F, I, X, J, M, system, floats, tables, r, at)
-    evaluate_affine(F, I, X, M, cell, VALUES, X[at], X[at + 1], X[at + 2], X[at + 3])
-    low, high = value_range(X, M, VALUES, I[cell + CELL_CAPACITY])
+    substitute_row(F, N, X, J, M, system, floats, tables, r, at)
+    evaluate_affine(F, N, X, M, cell, VALUES, X[at], X[at + 1], X[at + 2], X[at + 3])
+    low, high = value_range(X, M, VALUES, N[cell + CELL_CAPACITY])
     first, last = J[STATE_LOW * M + r], J[STATE_HIGH * M + r]
     knot = tables.first_knot[unit]
     while first < last and low >= tables.knots[knot + first]:
@@ -172,23 +175,23 @@ def open_choice(F, I, X, J, M, tables, cell, system, floats, r):
     J[CHOICE * M + r] = first
 
 
-@njit(cache=True)
-def emit_leaf(F, I, X, J, M, output, tables, slot_of_tag, cell, cell_rows, system, floats):
+@njit(cache=True, error_model="numpy")
+def emit_leaf(F, N, X, J, M, output, tables, slot_of_tag, cell, cell_rows, system, floats):
     """Enumerate the states of a small folded system over a cell and emit every polygon; returns their number.
 
     The cell's own state rows belong to another system (``cell_rows`` of them); the states of this system's rows are
     J[STATE_LOW], J[STATE_HIGH].
     """
-    rows = I[system + SYS_ROWS]
+    rows = N[system + SYS_ROWS]
     emitted = 0
     r = 0
     opening = True
     while True:
         if opening:
             while r < rows:
-                open_choice(F, I, X, J, M, tables, cell, system, floats, r)
+                open_choice(F, N, X, J, M, tables, cell, system, floats, r)
                 r += 1
-            emitted += emit_choice(F, I, X, J, M, output, tables, slot_of_tag, cell, cell_rows, system, floats)
+            emitted += emit_choice(F, N, X, J, M, output, tables, slot_of_tag, cell, cell_rows, system, floats)
             opening = False
         r -= 1
         if r < 0:

@@ -74,7 +74,7 @@ class Room(NamedTuple):
     corners: int
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def point_at_tables(tables):
     """The tables with pointers in place of arrays."""
     return Tables(
@@ -90,7 +90,7 @@ def point_at_tables(tables):
     )
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def point_at_output(output):
     """The output buffers with pointers in place of arrays."""
     return OutputArrays(
@@ -103,10 +103,10 @@ def point_at_output(output):
     )
 
 
-@njit(cache=True)
-def missing_room(I, control, room, counts, cell, rows, cols, levels):
+@njit(cache=True, error_model="numpy")
+def missing_room(N, control, room, counts, cell, rows, cols, levels):
     """The status to return if the next cell might not fit anywhere, else DONE; sets the NEED_* entries."""
-    vertices = I[cell + CELL_VERTICES]
+    vertices = N[cell + CELL_VERTICES]
     most = 2 * vertices + 8
     choices = control[LEAF_CHOICES]
     need_f = control[TOP_F] + folding_floats(rows, cols) + 6 * padded(most)
@@ -126,30 +126,30 @@ def missing_room(I, control, room, counts, cell, rows, cols, levels):
     return DONE
 
 
-@njit(cache=True)
-def count_choices(I, J, M, system, most):
+@njit(cache=True, error_model="numpy")
+def count_choices(N, J, M, system, most):
     """Product of the numbers of states the rows still have, or anything above ``most``."""
-    row_unit = system + SYS_HEADER + I[system + SYS_LEVELS] + 1
+    row_unit = system + SYS_HEADER + N[system + SYS_LEVELS] + 1
     product = 1
-    for r in range(I[system + SYS_ROWS]):
-        if I[row_unit + r] >= 0:
+    for r in range(N[system + SYS_ROWS]):
+        if N[row_unit + r] >= 0:
             product *= J[STATE_HIGH * M + r] - J[STATE_LOW * M + r] + 1
             if product > most:
                 return product
     return product
 
 
-@njit(cache=True)
-def choose_split(I, X, J, M, tables, system):
+@njit(cache=True, error_model="numpy")
+def choose_split(N, X, J, M, tables, system):
     """Row and knot to split at: of the unstable rows that are affine on the cell, the most evenly divided one."""
-    row_unit = system + SYS_HEADER + I[system + SYS_LEVELS] + 1
+    row_unit = system + SYS_HEADER + N[system + SYS_LEVELS] + 1
     best, best_row, best_knot = -1.0, -1, 0
-    for r in range(I[system + SYS_ROWS]):
+    for r in range(N[system + SYS_ROWS]):
         first, last = J[STATE_LOW * M + r], J[STATE_HIGH * M + r]
-        if I[row_unit + r] < 0 or first == last or X[RADIUS * M + r] > 0.0:
+        if N[row_unit + r] < 0 or first == last or X[RADIUS * M + r] > 0.0:
             continue
         low, high = X[LOW * M + r], X[HIGH * M + r]
-        knot = tables.first_knot[I[row_unit + r]]
+        knot = tables.first_knot[N[row_unit + r]]
         middle = 0.5 * (low + high)
         a, b = first, last - 1
         while a < b:
@@ -167,7 +167,7 @@ def choose_split(I, X, J, M, tables, system):
     return best_row, best_knot
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def half_range(X, J, M, n, count, side):
     """Range of the output's centre over the vertices of one half of a split cell."""
     low, high = 1e308, -1e308
@@ -183,103 +183,103 @@ def half_range(X, J, M, n, count, side):
     return low, high
 
 
-@njit(cache=True)
-def push_half(F, I, X, J, M, control, stack, cell, cell_rows, system, floats, count, side, row, knot, tag):
+@njit(cache=True, error_model="numpy")
+def push_half(F, N, X, J, M, control, stack, cell, cell_rows, system, floats, count, side, row, knot, tag):
     """Push one half of the cell, split in X[VALUES], as a cell over ``system`` whose states are in J."""
-    rows = I[system + SYS_ROWS]
+    rows = N[system + SYS_ROWS]
     half, half_floats = control[TOP_I], control[TOP_F]
-    total = write_half(F, I, X, J, M, cell, cell_rows, rows, VALUES, count, side, tag, half, half_floats)
-    I[half + CELL_SYSTEM_F], I[half + CELL_SYSTEM_I] = floats, system
-    I[half + CELL_DEPTH] = I[cell + CELL_DEPTH] + 1
+    total = write_half(F, N, X, J, M, cell, cell_rows, rows, VALUES, count, side, tag, half, half_floats)
+    N[half + CELL_SYSTEM_F], N[half + CELL_SYSTEM_I] = floats, system
+    N[half + CELL_DEPTH] = N[cell + CELL_DEPTH] + 1
     states = half + CELL_HEADER
     for r in range(rows):
-        I[states + r] = J[STATE_LOW * M + r]
-        I[states + rows + r] = J[STATE_HIGH * M + r]
+        N[states + r] = J[STATE_LOW * M + r]
+        N[states + rows + r] = J[STATE_HIGH * M + r]
     if side == 0:
-        I[states + rows + row] = knot
+        N[states + rows + row] = knot
     else:
-        I[states + row] = knot + 1
-    control[TOP_F] = half_floats + 3 * I[half + CELL_CAPACITY]
+        N[states + row] = knot + 1
+    control[TOP_F] = half_floats + 3 * N[half + CELL_CAPACITY]
     control[TOP_I] = half + cell_ints(rows, total)
-    I[half + CELL_END_F], I[half + CELL_END_I] = control[TOP_F], control[TOP_I]
+    N[half + CELL_END_F], N[half + CELL_END_I] = control[TOP_F], control[TOP_I]
     stack[control[STACK_TOP]] = half
     control[STACK_TOP] += 1
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def split_cell(
-    F, I, X, J, M, control, stack, tables, slot_of_tag, cell, cell_rows, system, floats, row, form, knot, slack
+    F, N, X, J, M, control, stack, tables, slot_of_tag, cell, cell_rows, system, floats, row, form, knot, slack
 ):
     """Push both halves of a cell, less those that the output's centre and ``slack`` exclude.
 
     ``form`` is the row that the splitting pre-activation has in X, ``row`` the one it has in ``system``.
     """
-    unit = I[system + SYS_HEADER + I[system + SYS_LEVELS] + 1 + row]
+    unit = N[system + SYS_HEADER + N[system + SYS_LEVELS] + 1 + row]
     plane = tables.first_knot[unit] + knot
     evaluate_affine(
-        F, I, X, M, cell, VALUES, X[form], X[M + form], X[2 * M + form], X[3 * M + form] - tables.knots[plane]
+        F, N, X, M, cell, VALUES, X[form], X[M + form], X[2 * M + form], X[3 * M + form] - tables.knots[plane]
     )
-    count = find_cut_edges(F, I, X, J, M, cell, cell_rows, VALUES)
+    count = find_cut_edges(F, N, X, J, M, cell, cell_rows, VALUES)
     link_cut_edges(J, M, slot_of_tag, count)
-    n = I[cell + CELL_VERTICES]
+    n = N[cell + CELL_VERTICES]
     for side in (1, 0):
         low, high = half_range(X, J, M, n, count, side)
         if low > slack or high < -slack:
             control[CHILDREN_PRUNED] += 1
             continue
         push_half(
-            F, I, X, J, M, control, stack, cell, cell_rows, system, floats, count, side, row, knot, 2 * plane + side
+            F, N, X, J, M, control, stack, cell, cell_rows, system, floats, count, side, row, knot, 2 * plane + side
         )
 
 
-@njit(cache=True)
-def visit(F, I, X, J, M, control, stack, output, tables, slot_of_tag, cell):
+@njit(cache=True, error_model="numpy")
+def visit(F, N, X, J, M, control, stack, output, tables, slot_of_tag, cell):
     """Process one cell that has been taken off the stack."""
-    floats, system = I[cell + CELL_SYSTEM_F], I[cell + CELL_SYSTEM_I]
-    rows = I[system + SYS_ROWS]
+    floats, system = N[cell + CELL_SYSTEM_F], N[cell + CELL_SYSTEM_I]
+    rows = N[system + SYS_ROWS]
     states = cell + CELL_HEADER
     for r in range(rows):
-        J[STATE_LOW * M + r] = I[states + r]
-        J[STATE_HIGH * M + r] = I[states + rows + r]
-    unstable = bound_units(F, I, X, J, M, tables, cell, system, floats)
-    radius = bound_output(F, I, X, M, system, floats)
+        J[STATE_LOW * M + r] = N[states + r]
+        J[STATE_HIGH * M + r] = N[states + rows + r]
+    unstable = bound_units(F, N, X, J, M, tables, cell, system, floats)
+    radius = bound_output(F, N, X, M, system, floats)
     at = CENTRE_AT * M
-    evaluate_affine(F, I, X, M, cell, OUT_VALUES, X[at], X[at + 1], X[at + 2], X[at + 3])
-    low, high = value_range(X, M, OUT_VALUES, I[cell + CELL_CAPACITY])
+    evaluate_affine(F, N, X, M, cell, OUT_VALUES, X[at], X[at + 1], X[at + 2], X[at + 3])
+    low, high = value_range(X, M, OUT_VALUES, N[cell + CELL_CAPACITY])
     size = abs(X[at]) + abs(X[at + 1]) + abs(X[at + 2]) + abs(X[at + 3]) + radius
     slack = radius + MARGIN * size * tables.extent
     if low > slack or high < -slack:
         control[PRUNED] += 1
         return
     folded, folded_floats = system, floats
-    choices = count_choices(I, J, M, system, control[LEAF_CHOICES])
+    choices = count_choices(N, J, M, system, control[LEAF_CHOICES])
     leaf = choices <= control[LEAF_CHOICES]
     row, knot = -1, 0
     if not leaf:
-        row, knot = choose_split(I, X, J, M, tables, system)
+        row, knot = choose_split(N, X, J, M, tables, system)
     form = row
-    settled = I[system + SYS_UNITS] - unstable
-    if leaf or 4 * settled >= I[system + SYS_UNITS]:
+    settled = N[system + SYS_UNITS] - unstable
+    if leaf or 4 * settled >= N[system + SYS_UNITS]:
         folded, folded_floats = control[TOP_I], control[TOP_F]
-        fold(F, I, X, J, M, system, floats, folded, folded_floats)
-        carry_states(I, J, M, tables, system, folded)
-        control[TOP_F] = folded_floats + I[folded + SYS_FLOATS]
-        control[TOP_I] = folded + I[folded + SYS_INTS]
+        fold(F, N, X, J, M, system, floats, folded, folded_floats)
+        carry_states(N, J, M, tables, system, folded)
+        control[TOP_F] = folded_floats + N[folded + SYS_FLOATS]
+        control[TOP_I] = folded + N[folded + SYS_INTS]
         control[FOLDS] += 1
         if not leaf:
             row = J[NEW_INDEX * M + row]
     if leaf:
         control[LEAVES] += 1
-        emit_leaf(F, I, X, J, M, output, tables, slot_of_tag, cell, rows, folded, folded_floats)
+        emit_leaf(F, N, X, J, M, output, tables, slot_of_tag, cell, rows, folded, folded_floats)
         if low == 0.0 and high == 0.0:
             control[CONSTANT_CELLS] += 1
         return
     split_cell(
-        F, I, X, J, M, control, stack, tables, slot_of_tag, cell, rows, folded, folded_floats, row, form, knot, slack
+        F, N, X, J, M, control, stack, tables, slot_of_tag, cell, rows, folded, folded_floats, row, form, knot, slack
     )
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def march(worker, tables, output, budget):
     """Visit cells until the worker's stack is empty; returns one of the status codes of this module.
 
@@ -287,11 +287,11 @@ def march(worker, tables, output, budget):
     how many weights to read before returning BUDGET_USED.
     """
     M = worker.X.size // X_REGIONS
-    F, I, X, J = pointer(worker.F), pointer(worker.I), pointer(worker.X), pointer(worker.J)
+    F, N, X, J = pointer(worker.F), pointer(worker.N), pointer(worker.X), pointer(worker.J)
     control, stack, slot_of_tag = pointer(worker.control), pointer(worker.stack), pointer(worker.slot_of_tag)
     knots = point_at_tables(tables)
     buffers = point_at_output(output)
-    room = Room(worker.F.size, worker.I.size, M, worker.stack.size, output.sizes.size, output.box_faces.size)
+    room = Room(worker.F.size, worker.N.size, M, worker.stack.size, output.sizes.size, output.box_faces.size)
     used = 0
     while control[STACK_TOP] > control[STACK_BOTTOM]:
         if control[STOP] != 0:
@@ -299,20 +299,20 @@ def march(worker, tables, output, budget):
         if used > budget:
             return BUDGET_USED
         cell = stack[control[STACK_TOP] - 1]
-        system = I[cell + CELL_SYSTEM_I]
-        rows, cols, levels = I[system + SYS_ROWS], I[system + SYS_COLS], I[system + SYS_LEVELS]
-        control[TOP_F], control[TOP_I] = I[cell + CELL_END_F], I[cell + CELL_END_I]
-        status = missing_room(I, control, room, output.counts, cell, rows, cols, levels)
+        system = N[cell + CELL_SYSTEM_I]
+        rows, cols, levels = N[system + SYS_ROWS], N[system + SYS_COLS], N[system + SYS_LEVELS]
+        control[TOP_F], control[TOP_I] = N[cell + CELL_END_F], N[cell + CELL_END_I]
+        status = missing_room(N, control, room, output.counts, cell, rows, cols, levels)
         if status != DONE:
             return status
         control[STACK_TOP] -= 1
         control[NODES] += 1
-        control[DEEPEST] = max(control[DEEPEST], I[cell + CELL_DEPTH])
+        control[DEEPEST] = max(control[DEEPEST], N[cell + CELL_DEPTH])
         used += 200 + rows * cols
         before = cycles()
-        visit(F, I, X, J, M, control, stack, buffers, knots, slot_of_tag, cell)
+        visit(F, N, X, J, M, control, stack, buffers, knots, slot_of_tag, cell)
         bin_ = 0
-        units = I[system + SYS_UNITS]
+        units = N[system + SYS_UNITS]
         while units > 0:
             bin_ += 1
             units >>= 1

@@ -1,19 +1,19 @@
 """Where things lie in the flat arrays that the kernels share.
 
-A worker owns two arenas, ``F`` (float64) and ``I`` (int64), which grow upwards like a stack, and two scratch arrays,
+A worker owns two arenas, ``F`` (float64) and ``N`` (int64), which grow upwards like a stack, and two scratch arrays,
 ``X`` (float64) and ``J`` (int64), cut into regions of ``M`` entries. Three kinds of blocks lie in the arenas.
 
 *System*: the network restricted to a cell and all cells inside it. ``rows`` units, padded level by level to a multiple of
 the lane width, ``cols`` outputs of these units, and the hash of the states of all units folded away.
 
-    I: the SYS_* header, level_start[levels + 1], row_unit[rows] (-1 where padded),
+    N: the SYS_* header, level_start[levels + 1], row_unit[rows] (-1 where padded),
        row_col[rows + 1], col_row[cols], col_begin[cols], col_end[cols] (the rows a column has weights on)
     F: affine parts a0[rows], a1[rows], a2[rows], a3[rows] (constant), weights[cols][rows],
        output weights[cols], output affine part[4]
 
 *Cell*: a simple convex polytope and its state ranges for the rows of its system.
 
-    I: the CELL_* header, state_low[rows], state_high[rows], tags[3 * vertices], neighbours[3 * vertices]
+    N: the CELL_* header, state_low[rows], state_high[rows], tags[3 * vertices], neighbours[3 * vertices]
     F: x[capacity], y[capacity], z[capacity], padded with copies of the last vertex
 
 A vertex lies on three planes, listed counter-clockwise seen from outside; ``neighbours[3 * v + i]`` is the other end of
@@ -33,33 +33,35 @@ CELL_END_F, CELL_END_I, CELL_DEPTH, CELL_HEADER = 5, 6, 7, 8
 # Scratch regions of X. CENTRE takes four (the affine coefficients of every row), POLY_A and POLY_B three, FORMS four.
 (CENTRE, RADIUS, LOW, HIGH, SLOPE, OFFSET, ERROR, OUT_COEF, VALUES, OUT_VALUES) = (0, 4, 5, 6, 7, 8, 9, 10, 11, 12)
 (POLY_A, POLY_B, POLY_VALUES, CUT_X, CUT_Y, CUT_Z, CENTRE_AT, FORMS) = (13, 16, 19, 20, 21, 22, 23, 24)
-X_REGIONS = 28
+OUTPUTS = 28  # eight
+X_REGIONS = 36
 
 # Scratch regions of J.
 (STATE_LOW, STATE_HIGH, NEW_INDEX, CUT_OUT, CUT_IN, CUT_NEXT, CUT_PREVIOUS, CUT_FROM) = (0, 1, 2, 3, 4, 5, 6, 7)
 (TAGS_A, TAGS_B, CUT_TO, KEPT_ROWS, STABLE_COLS, CHOICE, CHOICE_FIRST, CHOICE_LAST) = (8, 9, 10, 11, 12, 13, 14, 15)
-J_REGIONS = 16
+(READ_COLS, READ_AT) = (16, 17)
+J_REGIONS = 18
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def padded(count: int) -> int:
     """``count`` rounded up to a multiple of the lane width."""
     return (count + 3) & ~3
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def system_ints(rows: int, cols: int, levels: int) -> int:
     """Number of int64 a system takes."""
     return SYS_HEADER + levels + 1 + 2 * rows + 1 + 3 * cols
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def system_floats(rows: int, cols: int) -> int:
     """Number of float64 a system takes, padded to the lane width."""
     return 4 * rows + cols * rows + padded(cols) + 4
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def cell_ints(rows: int, vertices: int) -> int:
     """Number of int64 a cell takes."""
     return CELL_HEADER + 2 * rows + 6 * vertices

@@ -23,22 +23,19 @@ from mn_onnx.extract.kernels.memory import (
     CUT_PREVIOUS,
     CUT_TO,
     CUT_X,
-    CUT_Y,
-    CUT_Z,
     NEW_INDEX,
     POLY_VALUES,
     padded,
 )
 
-
 TINY = 1e-300
 
 
-@njit(cache=True)
-def evaluate_affine(F, I, X, M, cell, region, a0, a1, a2, a3):
+@njit(cache=True, error_model="numpy")
+def evaluate_affine(F, N, X, M, cell, region, a0, a1, a2, a3):
     """``X[region]`` = a . x + a3 at the cell's vertices (and at its padding, which repeats the last one)."""
-    x = I[cell + CELL_FLOATS]
-    capacity = I[cell + CELL_CAPACITY]
+    x = N[cell + CELL_FLOATS]
+    capacity = N[cell + CELL_CAPACITY]
     b0, b1, b2, b3 = splat(a0), splat(a1), splat(a2), splat(a3)
     out = region * M
     for v in range(0, capacity, 4):
@@ -46,19 +43,19 @@ def evaluate_affine(F, I, X, M, cell, region, a0, a1, a2, a3):
         store(X, out + v, value)
 
 
-@njit(cache=True)
-def find_cut_edges(F, I, X, J, M, cell, rows, values):
+@njit(cache=True, error_model="numpy")
+def find_cut_edges(F, N, X, J, M, cell, rows, values):
     """Collect the edges on which ``X[values]`` changes sign, from the negative to the positive end.
 
     Fills CUT_FROM and CUT_TO (``3 * vertex + slot`` at either end), the corner's position CUT_X, CUT_Y, CUT_Z and the
     tags CUT_IN, CUT_OUT along which the polygon of the cut comes in and leaves, seen from the positive side.
     Returns the number of edges.
     """
-    n = I[cell + CELL_VERTICES]
+    n = N[cell + CELL_VERTICES]
     tags = cell + CELL_HEADER + 2 * rows
     neighbours = tags + 3 * n
-    x = I[cell + CELL_FLOATS]
-    capacity = I[cell + CELL_CAPACITY]
+    x = N[cell + CELL_FLOATS]
+    capacity = N[cell + CELL_CAPACITY]
     t = values * M
     count = 0
     for v in range(n):
@@ -66,20 +63,20 @@ def find_cut_edges(F, I, X, J, M, cell, rows, values):
         if tv >= 0.0:
             continue
         for i in range(3):
-            u = I[neighbours + 3 * v + i]
+            u = N[neighbours + 3 * v + i]
             tu = X[t + u]
             if tu < 0.0:
                 continue
             j = 0
-            while I[neighbours + 3 * u + j] != v:
+            while N[neighbours + 3 * u + j] != v:
                 j += 1
             k1 = i + 1 if i < 2 else 0
             k2 = i - 1 if i > 0 else 2
             s = tv / (tv - tu)
             J[CUT_FROM * M + count] = 3 * v + i
             J[CUT_TO * M + count] = 3 * u + j
-            J[CUT_OUT * M + count] = I[tags + 3 * v + k1]
-            J[CUT_IN * M + count] = I[tags + 3 * v + k2]
+            J[CUT_OUT * M + count] = N[tags + 3 * v + k1]
+            J[CUT_IN * M + count] = N[tags + 3 * v + k2]
             for axis in range(3):
                 at = x + axis * capacity
                 X[(CUT_X + axis) * M + count] = F[at + v] + s * (F[at + u] - F[at + v])
@@ -87,7 +84,7 @@ def find_cut_edges(F, I, X, J, M, cell, rows, values):
     return count
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def link_cut_edges(J, M, slot_of_tag, count):
     """Order the corners of a cut: CUT_NEXT and CUT_PREVIOUS. ``slot_of_tag`` is scratch of one entry per tag."""
     for j in range(count):
@@ -98,18 +95,18 @@ def link_cut_edges(J, M, slot_of_tag, count):
         J[CUT_PREVIOUS * M + following] = j
 
 
-@njit(cache=True)
-def write_half(F, I, X, J, M, cell, rows, half_rows, values, count, side, tag, half, half_floats):
+@njit(cache=True, error_model="numpy")
+def write_half(F, N, X, J, M, cell, rows, half_rows, values, count, side, tag, half, half_floats):
     """Write one half of a split cell's polytope; the caller fills the rest of the header and the states.
 
-    ``side`` 0 keeps the negative vertices, 1 the others. ``half`` and ``half_floats`` are its places in I and F.
+    ``side`` 0 keeps the negative vertices, 1 the others. ``half`` and ``half_floats`` are its places in N and F.
     ``rows`` and ``half_rows`` are the rows of the cell's and the half's systems. Returns the number of vertices.
     """
-    n = I[cell + CELL_VERTICES]
+    n = N[cell + CELL_VERTICES]
     tags = cell + CELL_HEADER + 2 * rows
     neighbours = tags + 3 * n
-    x = I[cell + CELL_FLOATS]
-    capacity = I[cell + CELL_CAPACITY]
+    x = N[cell + CELL_FLOATS]
+    capacity = N[cell + CELL_CAPACITY]
     t = values * M
     kept = 0
     for v in range(n):
@@ -120,9 +117,9 @@ def write_half(F, I, X, J, M, cell, rows, half_rows, values, count, side, tag, h
     new_capacity = padded(total)
     new_tags = half + CELL_HEADER + 2 * half_rows
     new_neighbours = new_tags + 3 * total
-    I[half + CELL_VERTICES] = total
-    I[half + CELL_CAPACITY] = new_capacity
-    I[half + CELL_FLOATS] = half_floats
+    N[half + CELL_VERTICES] = total
+    N[half + CELL_CAPACITY] = new_capacity
+    N[half + CELL_FLOATS] = half_floats
     for v in range(n):
         if (X[t + v] >= 0.0) != (side == 1):
             continue
@@ -130,9 +127,9 @@ def write_half(F, I, X, J, M, cell, rows, half_rows, values, count, side, tag, h
         for axis in range(3):
             F[half_floats + axis * new_capacity + w] = F[x + axis * capacity + v]
         for i in range(3):
-            I[new_tags + 3 * w + i] = I[tags + 3 * v + i]
+            N[new_tags + 3 * w + i] = N[tags + 3 * v + i]
             # An edge that is cut has its far end on the other side; that entry is set below.
-            I[new_neighbours + 3 * w + i] = J[NEW_INDEX * M + I[neighbours + 3 * v + i]]
+            N[new_neighbours + 3 * w + i] = J[NEW_INDEX * M + N[neighbours + 3 * v + i]]
     near = (CUT_FROM if side == 0 else CUT_TO) * M
     for j in range(count):
         w = kept + j
@@ -141,21 +138,21 @@ def write_half(F, I, X, J, M, cell, rows, half_rows, values, count, side, tag, h
         end = J[near + j]
         v = end // 3
         i = end - 3 * v
-        I[new_neighbours + 3 * J[NEW_INDEX * M + v] + i] = w
+        N[new_neighbours + 3 * J[NEW_INDEX * M + v] + i] = w
         incoming, outgoing = J[CUT_IN * M + j], J[CUT_OUT * M + j]
         following, previous = kept + J[CUT_NEXT * M + j], kept + J[CUT_PREVIOUS * M + j]
-        I[new_tags + 3 * w] = tag
-        I[new_neighbours + 3 * w] = J[NEW_INDEX * M + v]
+        N[new_tags + 3 * w] = tag
+        N[new_neighbours + 3 * w] = J[NEW_INDEX * M + v]
         if side == 0:
-            I[new_tags + 3 * w + 1] = incoming
-            I[new_tags + 3 * w + 2] = outgoing
-            I[new_neighbours + 3 * w + 1] = following
-            I[new_neighbours + 3 * w + 2] = previous
+            N[new_tags + 3 * w + 1] = incoming
+            N[new_tags + 3 * w + 2] = outgoing
+            N[new_neighbours + 3 * w + 1] = following
+            N[new_neighbours + 3 * w + 2] = previous
         else:
-            I[new_tags + 3 * w + 1] = outgoing
-            I[new_tags + 3 * w + 2] = incoming
-            I[new_neighbours + 3 * w + 1] = previous
-            I[new_neighbours + 3 * w + 2] = following
+            N[new_tags + 3 * w + 1] = outgoing
+            N[new_tags + 3 * w + 2] = incoming
+            N[new_neighbours + 3 * w + 1] = previous
+            N[new_neighbours + 3 * w + 2] = following
     for axis in range(3):
         at = half_floats + axis * new_capacity
         for w in range(total, new_capacity):
@@ -163,7 +160,7 @@ def write_half(F, I, X, J, M, cell, rows, half_rows, values, count, side, tag, h
     return total
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def read_cut_polygon(X, J, M, count, polygon, tags):
     """Copy a linked cut to a polygon: corners in ``X[polygon : polygon + 3]``, the tag of each edge in ``J[tags]``."""
     j = 0
@@ -174,7 +171,7 @@ def read_cut_polygon(X, J, M, count, polygon, tags):
         j = J[CUT_NEXT * M + j]
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def clip_polygon(X, J, M, count, polygon, tags, result, result_tags, a0, a1, a2, a3, side, tag, gradient):
     """Keep the part of a convex polygon where a . x + a3 is negative (side 0) or not (side 1).
 

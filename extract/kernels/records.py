@@ -36,7 +36,7 @@ class WorkerArrays(NamedTuple):
     """One worker's memory; see `kernels.memory`."""
 
     F: Floats
-    I: Integers  # noqa: E741
+    N: Integers
     X: Floats
     J: Integers
     control: Integers
