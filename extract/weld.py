@@ -152,8 +152,8 @@ def _group_by_key(keys: NDArray[np.uint64], threads: int) -> tuple[Indices, NDAr
     return group_items(partitions, 1 << bits, threads)
 
 
-def _first_corners(keys: NDArray[np.uint64], threads: int) -> Indices:
-    """For each corner the first corner with the same key, [c]."""
+def first_of_equal_keys(keys: NDArray[np.uint64], threads: int) -> Indices:
+    """For each row of ``keys``, uint64 [n, 2], the first row equal to it: [n]."""
     order, starts = _group_by_key(keys, threads)
     first_corners = np.empty_like(order)
     run_blocks(
@@ -166,7 +166,7 @@ def _first_corners(keys: NDArray[np.uint64], threads: int) -> Indices:
 
 def _weld_corners(soup: PolygonSoup, threads: int) -> tuple[Floats, Indices, int, float]:
     """Vertices, the vertex of each corner, how many corners disagree with their vertex, and by how much at most."""
-    first_corners = _first_corners(soup.keys, threads)
+    first_corners = first_of_equal_keys(soup.keys, threads)
     n_blocks = block_count(first_corners.size)
     counts = np.zeros(n_blocks + 1, np.int64)
 
