@@ -144,7 +144,7 @@ def _add_model(parser: argparse.ArgumentParser) -> None:
         metavar="NAME=VALUE",
         help="fix another input: a number, numbers with commas, or a .npy file; repeatable",
     )
-    field.add_argument("--coordinates", metavar="I,J,K", help="columns of the input that are the point, if it has more")
+    field.add_argument("--coordinates", metavar="I,J,K", help="columns or inputs that are the coordinates, in order")
     smooth = parser.add_argument_group("smooth activations")
     smooth.add_argument("--surrogate-tol", type=float, metavar="T", help="error allowed per piecewise-linear surrogate")
     smooth.add_argument("--knots-per-period", type=int, metavar="N", help="knots per period of sines and cosines")

@@ -4,6 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from mn_onnx.extract.surface import Surface
 
 
 class MnOnnxError(Exception):
@@ -15,7 +19,15 @@ class UsageError(MnOnnxError):
 
 
 class CheckFailed(MnOnnxError):
-    """A result contradicts its checks: parity with onnxruntime, or the invariants of the mesh."""
+    """A result contradicts its checks: parity with onnxruntime, or the invariants of the mesh.
+
+    ``problems``: every failed check, a sentence each. ``surface``: the mesh that failed, with its report, if there is one.
+    """
+
+    def __init__(self, problems: Sequence[str], surface: Surface | None = None) -> None:
+        self.problems = list(problems)
+        self.surface = surface
+        super().__init__("\n".join(f"check failed: {problem}" for problem in self.problems))
 
 
 @dataclass(frozen=True)

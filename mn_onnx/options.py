@@ -92,14 +92,14 @@ def _parse_numbers(text: str, value: str) -> Floats:
     return np.float64(numbers[0]).reshape(()) if len(numbers) == 1 else np.asarray(numbers, np.float64)
 
 
-def coordinate_columns(text: str | None) -> list[int] | None:
-    """``I,J,K`` as a list of column indices. Raises `UsageError` if they are not distinct whole numbers."""
+def coordinates(text: str | None) -> list[int | str] | None:
+    """``I,J,K`` as a list: numbers of columns, or names of inputs as they stand.
+
+    Raises `UsageError` if one is empty or comes twice.
+    """
     if text is None:
         return None
-    try:
-        columns = [int(part) for part in text.split(",")]
-    except ValueError as error:
-        raise UsageError(f"--coordinates {text}: expected column numbers such as 0,1,2") from error
-    if len(set(columns)) != len(columns):
-        raise UsageError(f"--coordinates {text}: a column is named twice")
-    return columns
+    parts = [part.strip() for part in text.split(",")]
+    if not all(parts) or len(set(parts)) != len(parts):
+        raise UsageError(f"--coordinates {text}: expected different columns such as 0,1,2, or names of inputs")
+    return [int(part) if re.fullmatch(r"-?\d+", part) else part for part in parts]

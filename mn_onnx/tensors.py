@@ -1,4 +1,4 @@
-"""The stored tensors of a model: where they are, whether their data fit their declaration, external and sparse storage."""
+"""The stored tensors of a model: whether their data fit their declaration, external files, sparse storage."""
 
 from __future__ import annotations
 
@@ -112,7 +112,7 @@ def _location_fault(location: str, folder: Path | None) -> tuple[str, str] | Non
 def tensor_problem(stored: StoredTensor) -> Problem | None:
     """What is wrong with the tensor's data: wrong amount, unknown type, or weights that are not finite.
 
-    A single non-finite number may be a legal constant (the open end of a Clip, a NaN guard) and is left to the lowering.
+    A single such number may be a legal constant (the open end of a Clip, a NaN guard) and is left to the lowering.
     """
     tensor = stored.tensor
     shape = tuple(tensor.dims)
@@ -132,7 +132,8 @@ def tensor_problem(stored: StoredTensor) -> Problem | None:
             fault = f"the tensor {tensor.name!r} of shape {list(shape)} cannot be read: {error}"
         else:
             if values.size > 1 and _is_float(tensor.data_type):
-                finite = np.isfinite(values.astype(np.float64))
+                with np.errstate(invalid="ignore"):  # a signalling NaN warns in the cast
+                    finite = np.isfinite(values.astype(np.float64))
                 if not finite.all():
                     count = int(values.size - np.count_nonzero(finite))
                     return Problem(
@@ -184,7 +185,7 @@ def densify_constants(graph: onnx.GraphProto) -> list[Problem]:
 
 
 def _dense(sparse: onnx.SparseTensorProto) -> np.ndarray:
-    """The array of a COO tensor: indices are [nnz] into the flattened array, or [nnz, rank] (ONNX: SparseTensorProto)."""
+    """The array of a COO tensor: indices are [nnz] into the flattened array, or [nnz, rank] (as ONNX defines)."""
     shape = tuple(sparse.dims)
     values = numpy_helper.to_array(sparse.values)
     indices = numpy_helper.to_array(sparse.indices)

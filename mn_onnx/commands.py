@@ -1,0 +1,167 @@
+"""The commands of the command line, each a function from parsed options to an exit code."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+from mn_onnx import options as parse
+from mn_onnx.errors import CheckFailed, ModelRefused, UsageError
+from mn_onnx.model import LoadOptions, load
+
+
+def run_extract(options: argparse.Namespace) -> int:
+    """``mn-onnx extract``: write the mesh, and the report if asked; returns 0.
+
+    Raises `CheckFailed`, after the report is written, if a check fails or the level set is empty; no mesh is then left.
+    """
+    from mn_onnx.extract.files import MeshFileError, check_mesh_options, write_mesh
+    from mn_onnx.extraction import extract
+    from mn_onnx.progress import ProgressEvent, TerminalProgress
+
+    try:
+        check_mesh_options(options.mesh, float64=options.float64)
+    except MeshFileError as error:
+        raise UsageError(str(error)) from error
+    if options.report is not None:
+        _check_report_path(Path(options.report))
+    with TerminalProgress(enabled=not options.quiet) as progress:
+        progress(ProgressEvent("import"))
+        model = load(options.model, **_load_options(options))
+        try:
+            surface = extract(model, threads=options.threads, check=not options.no_check, progress=progress)
+        except CheckFailed as error:
+            if error.surface is not None:
+                _write_report(options.report, error.surface.report)
+            raise CheckFailed([*error.problems, "no mesh was written; --no-check writes it all the same"]) from error
+        report = dict(surface.report)
+        if not surface.n_polygons:
+            _write_report(options.report, report)
+            raise CheckFailed(report["notes"])
+        progress(ProgressEvent("write"))
+        started = time.perf_counter()
+        try:
+            write_mesh(surface, options.mesh, float64=options.float64, triangulate=options.triangulate)
+        except OSError as error:
+            raise UsageError(f"cannot write {options.mesh}: {error.strerror or error}") from error
+        report["seconds"] = {**report["seconds"], "write": time.perf_counter() - started}
+    _write_report(options.report, report)
+    for problem in report["problems"]:
+        print(f"mn-onnx: warning: {problem}", file=sys.stderr)
+    if not options.quiet:
+        print(_summary(options.mesh, report))
+    return 0
+
+
+def run_inspect(options: argparse.Namespace) -> int:
+    """``mn-onnx inspect``: print what the model is; returns 0, or raises `ModelRefused`."""
+    from mn_onnx.inspection import as_text, describe, describe_refusal
+    from mn_onnx.ir.text import dump
+
+    try:
+        model = load(options.model, **_load_options(options))
+    except ModelRefused as error:
+        if options.json:
+            _print_json(describe_refusal(Path(options.model).name, error.problems))
+        raise
+    if options.stage is not None:
+        network = model.imported.network if options.stage == "imported" else model.network
+        if options.json:
+            _print_json({**describe(model), "stage": options.stage, "network": dump(network)})
+        else:
+            print(dump(network))
+    elif options.json:
+        _print_json(describe(model))
+    else:
+        print(as_text(describe(model)))
+    return 0
+
+
+def run_verify(options: argparse.Namespace) -> int:
+    """``mn-onnx verify``: print the checks of a mesh file; returns 0, or raises `CheckFailed`."""
+    from mn_onnx.verification import verify
+
+    model = load(options.model, **_load_options(options))
+    result = verify(options.mesh, model, tolerance=options.tolerance, threads=options.threads)
+    if options.json:
+        _print_json(result)
+    else:
+        print(_summary(options.mesh, result))
+    if result["problems"]:
+        raise CheckFailed(result["problems"])
+    return 0
+
+
+def _load_options(options: argparse.Namespace) -> LoadOptions:
+    return {
+        "output": options.output,
+        "level": options.level,
+        "bounds": options.bounds,
+        "bind": parse.bindings(options.bind),
+        "coordinates": parse.coordinates(options.coordinates),
+        "surrogate_tol": options.surrogate_tol,
+        "knots_per_period": options.knots_per_period,
+    }
+
+
+def _check_report_path(path: Path) -> None:
+    if path.is_dir():
+        raise UsageError(f"--report {path}: this is a folder")
+    if not path.absolute().parent.is_dir():
+        raise UsageError(f"--report {path}: the folder {path.absolute().parent} does not exist")
+
+
+def _write_report(target: str | None, report: Any) -> None:
+    """Write ``report`` as JSON, whole or not at all; nothing if ``target`` is None."""
+    if target is None:
+        return
+    path = Path(target)
+    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
+    try:
+        partial.write_text(json.dumps(report, indent=2, allow_nan=False) + "\n")
+        partial.replace(path)
+    except OSError as error:
+        raise UsageError(f"cannot write the report {target}: {error.strerror or error}") from error
+    finally:
+        partial.unlink(missing_ok=True)
+
+
+def _print_json(value: Any) -> None:
+    print(json.dumps(value, indent=2, allow_nan=False))
+
+
+def _summary(mesh: str, report: dict[str, Any]) -> str:
+    """A few lines about a mesh."""
+    if report["unmatched_edges"]:
+        closure = f"{report['unmatched_edges']:,} edges without neighbour"
+    elif report["boundary_edges"]:
+        closure = "closed but for where it leaves the box"
+    else:
+        closure = "closed"
+    lines = [
+        f"{mesh}: {report['polygons']:,} polygons, {report['vertices']:,} vertices, {report['components']} components, "
+        f"Euler number {report['euler']}, {closure}"
+    ]
+    if report["max_abs_f"] is not None:
+        lines.append(f"  |f| on the mesh: max {report['max_abs_f']:.2g}, mean {report['mean_abs_f']:.2g}")
+    if not report["exact"]:
+        lines.append(
+            f"  surrogates within {report['surrogate_eps']:.2g} of the true network, whose |f - level| on the mesh is "
+            f"{report['true_mean_abs_f']:.2g} in the mean"
+            if report["true_mean_abs_f"] is not None
+            else f"  surrogates within {report['surrogate_eps']:.2g} of the true network"
+        )
+    if report["parity_runtime"] is not None:
+        lines.append(
+            f"  {report['parity_runtime']}: differs by {report['parity_max_abs_err']:.2g} "
+            f"({report['parity_allowed_err']:.2g} allowed), mean |f - level| {report['ort_mean_abs_f']:.2g}"
+        )
+    if "seconds" in report:
+        lines.append("  " + ", ".join(f"{phase} {seconds:.2f} s" for phase, seconds in report["seconds"].items()))
+    lines += [f"  note: {note}" for note in report["notes"]]
+    return "\n".join(lines)

@@ -1,0 +1,169 @@
+"""The library's main function: from a model to a checked mesh."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from typing import Unpack
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mn_onnx.errors import CheckFailed, UsageError
+from mn_onnx.extract.invariants import Invariants, check_invariants
+from mn_onnx.extract.schedule import Progress, TraversalStatistics, traverse
+from mn_onnx.extract.surface import Surface
+from mn_onnx.extract.weld import weld
+from mn_onnx.model import LoadOptions, Model, load
+from mn_onnx.parity import Parity, check_parity
+from mn_onnx.progress import ProgressCallback, ProgressEvent
+from mn_onnx.reader import ModelSource
+from mn_onnx.report import build_report
+from mn_onnx.residual import Residuals, measure_residuals
+from mn_onnx.runtime import Runtime
+from mn_onnx.warmup import warm_up
+
+
+@dataclass
+class _Phases:
+    """Tells the listener which phase begins, and keeps the time of each."""
+
+    listener: ProgressCallback | None
+    seconds: dict[str, float] = field(default_factory=dict)
+
+    def announce(self, event: ProgressEvent) -> None:
+        if self.listener is not None:
+            self.listener(event)
+
+    @contextmanager
+    def phase(self, name: str) -> Iterator[None]:
+        self.announce(ProgressEvent(name))
+        started = time.perf_counter()
+        yield
+        self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - started
+
+
+def extract(
+    source: Model | ModelSource,
+    *,
+    threads: int | None = None,
+    check: bool = True,
+    progress: ProgressCallback | None = None,
+    **options: Unpack[LoadOptions],
+) -> Surface:
+    """Extract the level set {x in box | f(x) = level} as a welded mesh of convex polygons.
+
+    ``source``: a `Model` from `load`, or what `load` takes (path, bytes or message), with ``options`` as there.
+    ``threads``: all cores by default; the mesh does not depend on it. ``check``: compare the imported network with
+    onnxruntime before, and measure the mesh after. ``progress``: called with a `ProgressEvent` a few times a second.
+
+    Returns a `Surface`: ``vertices`` float64 [v, 3], polygons oriented towards growing f, and ``report``, whose keys
+    `mn_onnx.report` lists. An empty level set is a surface without polygons.
+
+    Raises `UsageError` and `ModelRefused` as `load`; `CheckFailed` with every failed check (``error.surface`` is the
+    mesh, if there is one already).
+    """
+    phases = _Phases(progress)
+    if isinstance(source, Model):
+        if options:
+            raise UsageError(f"the model is loaded already: give {', '.join(options)} to load")
+        model = source
+    else:
+        phases.announce(ProgressEvent("import"))
+        model = load(source, **options)
+    if threads is not None and threads < 1:
+        raise UsageError(f"threads must be at least 1, not {threads}")
+    phases.seconds.update(model.seconds)
+
+    runtime = parity = residuals = None
+    if check:
+        with phases.phase("check"):
+            runtime = Runtime(model.read, model.imported.layout)
+            parity = check_parity(model, runtime)
+            if parity.problems():
+                raise CheckFailed(parity.problems())
+    with phases.phase("compile"):
+        warm_up(model.dimension)
+    with phases.phase("traverse"):
+        soup, statistics = traverse(
+            model.network, model.lower, model.upper, threads=threads, progress=_traversal_listener(phases)
+        )
+    with phases.phase("weld"):
+        surface = weld(soup, threads=threads)
+        del soup
+    with phases.phase("check"):
+        invariants = check_invariants(surface, bounds=model.bounds)
+        if check and surface.n_polygons and invariants.area > 0:
+            residuals = measure_residuals(model, surface, runtime)
+    problems, notes = findings(model, invariants, parity, residuals, statistics)
+    report = build_report(
+        model,
+        invariants=invariants,
+        statistics=statistics,
+        parity=parity,
+        residuals=residuals,
+        seconds=phases.seconds,
+        problems=problems,
+        notes=notes,
+    )
+    surface = surface.with_report(**report)
+    if check and problems:
+        raise CheckFailed(problems, surface)
+    return surface
+
+
+def _traversal_listener(phases: _Phases) -> Callable[[Progress], None] | None:
+    if phases.listener is None:
+        return None
+
+    def listen(event: Progress) -> None:
+        phases.announce(ProgressEvent("traverse", event.nodes, event.polygons))
+
+    return listen
+
+
+def findings(
+    model: Model,
+    invariants: Invariants,
+    parity: Parity | None,
+    residuals: Residuals | None,
+    statistics: TraversalStatistics,
+) -> tuple[list[str], list[str]]:
+    """What failed, and what is legal but worth knowing, a sentence each."""
+    problems, notes = invariants.problems(), invariants.notes()
+    if residuals is not None and residuals.worst_ratio > 1:
+        problems.append(
+            f"|f| is up to {residuals.max_abs_f:.3g} on the mesh, "
+            f"{residuals.worst_ratio:.3g} times what rounding explains"
+        )
+    if parity is not None and parity.note:
+        notes.append(f"{parity.note}; compared with {parity.runtime} instead")
+    if statistics.constant_cells:
+        notes.append(
+            f"f is at the level throughout {statistics.constant_cells} cells: the level set has solid parts there, "
+            "of which the mesh shows the boundary at most"
+        )
+    if not invariants.polygons:
+        notes.append(empty_level_set(model))
+    return problems, notes
+
+
+def empty_level_set(model: Model) -> str:
+    """Why there is nothing to extract, with the certified range of f and the level nearest to the asked one."""
+    low, high = model.output_range
+    sign = "positive" if low >= 0 else "negative" if high <= 0 else "of one sign"
+    values = model.evaluate(_grid(model))
+    nearest = values[np.abs(values - model.level).argmin()]
+    return (
+        f"the level set is empty: f - level is {sign} in the box (certified range {low:.6g} to {high:.6g}); "
+        f"the output comes nearest to {model.level:g} with {nearest:.6g}, found on a grid; try --level or --bounds"
+    )
+
+
+def _grid(model: Model) -> NDArray[np.float64]:
+    """About 30,000 points in the box, float64 [n, dimension]."""
+    per_axis = round(30_000 ** (1 / model.dimension))
+    axes = [np.linspace(low, high, per_axis) for low, high in model.bounds]
+    return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, model.dimension)

@@ -1,0 +1,137 @@
+"""A loaded model: the network as imported, the canonical network of its level set, and the box."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TypedDict, Unpack
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from mn_onnx.errors import UsageError
+from mn_onnx.importer import Imported, import_network
+from mn_onnx.ir.bounds import output_bounds
+from mn_onnx.ir.evaluate import evaluate
+from mn_onnx.ir.network import Network
+from mn_onnx.ir.passes import Canonical, canonicalize
+from mn_onnx.options import DEFAULT_BOUNDS, bounds_from_metadata, box, output_and_channel
+from mn_onnx.reader import ModelSource, ReadModel, read_model
+
+Floats = NDArray[np.float64]
+
+
+class LoadOptions(TypedDict, total=False):
+    """What to extract from a model; all have defaults.
+
+    ``output``: name of the output, ``NAME:CHANNEL`` if it has several values per point.
+    ``level``: value of the level set, 0.
+    ``bounds``: the box: ``(low, high)``, or a pair for each axis; by default the entry ``bounds`` of the model's
+    metadata, else [-1, 1] on every axis.
+    ``bind``: values for the other inputs, by name: numbers or arrays of the input's shape.
+    ``coordinates``: which columns of the input are the point, if it has more.
+    ``surrogate_tol``: error allowed for the piecewise-linear surrogate of each smooth activation.
+    ``knots_per_period``: knots per period of sines and cosines.
+    """
+
+    output: str | None
+    level: float
+    bounds: ArrayLike | None
+    bind: Mapping[str, ArrayLike] | None
+    coordinates: Sequence[int | str] | None
+    surrogate_tol: float | None
+    knots_per_period: int | None
+
+
+@dataclass(frozen=True, eq=False)
+class Model:
+    """A network ready for extraction.
+
+    ``read``: the ONNX model. ``imported``: what it computes, with the true activations, and how its inputs are fed.
+    ``canonical``: the piecewise-linear network whose level set f = 0 is asked for. ``level``: the value of the original
+    output there. ``lower``, ``upper``: float64 [dimension], the box. ``seconds``: time per phase.
+    """
+
+    read: ReadModel
+    imported: Imported
+    canonical: Canonical
+    level: float
+    lower: Floats
+    upper: Floats
+    seconds: Mapping[str, float]
+
+    @property
+    def network(self) -> Network:
+        """The canonical network."""
+        return self.canonical.network
+
+    @property
+    def dimension(self) -> int:
+        """The number of coordinates of a point."""
+        return self.network.input_dim
+
+    @property
+    def exact(self) -> bool:
+        """Whether the network is piecewise linear as it stands, so that no surrogate stands in for an activation."""
+        return self.canonical.exact
+
+    @property
+    def surrogate_eps(self) -> float:
+        """A proved bound on |f_true - f| in the box; zero for exact networks."""
+        return self.canonical.surrogate_eps
+
+    @cached_property
+    def output_range(self) -> tuple[float, float]:
+        """Certified bounds of the canonical f in the box; the level set is empty if zero is not between them."""
+        return output_bounds(self.network, self.lower, self.upper)
+
+    @property
+    def bounds(self) -> Floats:
+        """The box as pairs, float64 [dimension, 2]."""
+        return np.stack([self.lower, self.upper], axis=1)
+
+    def evaluate(self, points: ArrayLike) -> Floats:
+        """The original output, with its true activations, in float64.
+
+        ``points``: [n, dimension]; returns float64 [n]. Raises ValueError for points of another dimension.
+        """
+        return evaluate(self.imported.network, np.asarray(points, np.float64), true_functions=True)
+
+
+def load(source: ModelSource, **options: Unpack[LoadOptions]) -> Model:
+    """Read an ONNX model and bring it into canonical form.
+
+    ``source``: a path, the bytes of a file, or an `onnx.ModelProto`. ``options``: see `LoadOptions`.
+
+    Raises `UsageError` for wrong options and unreadable paths, `ModelRefused` with every reason if the model is damaged
+    or holds what cannot be extracted.
+    """
+    started = time.perf_counter()
+    level = options.get("level", 0.0)
+    if not np.isfinite(level):
+        raise UsageError(f"the level {level} is not a finite number")
+    read = read_model(source)
+    output, channel = output_and_channel(options.get("output"), [value.name for value in read.model.graph.output])
+    imported = import_network(
+        read.model,
+        output=output,
+        channel=channel,
+        bind=options.get("bind"),
+        coordinates=options.get("coordinates"),
+    )
+    bounds = options.get("bounds")
+    if bounds is None:
+        bounds = bounds_from_metadata(imported.metadata) or DEFAULT_BOUNDS
+    lower, upper = box(bounds, imported.input_dim)
+    read_in = time.perf_counter()
+    canonical = canonicalize(
+        imported.network,
+        level=level,
+        bounds=(lower, upper),
+        surrogate_tol=options.get("surrogate_tol"),
+        knots_per_period=options.get("knots_per_period"),
+    )
+    seconds = {"import": read_in - started, "lower": time.perf_counter() - read_in}
+    return Model(read, imported, canonical, level, lower, upper, seconds)

@@ -1,0 +1,108 @@
+"""Whether what was imported is what other programs compute: comparison with onnxruntime at points of the box."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mn_onnx.ir.evaluate import evaluate, float32_error_bound
+from mn_onnx.model import Model
+from mn_onnx.runtime import Runtime
+
+Floats = NDArray[np.float64]
+
+UNIFORM_POINTS = 4096
+NEAR_SURFACE_POINTS = 2048
+BISECTIONS = 20
+BATCH_SIZES = (1, 2, 7)
+"""Besides one large batch: a network whose value at a point depends on the other points differs between them."""
+
+
+@dataclass(frozen=True)
+class Parity:
+    """The outcome of a comparison.
+
+    ``runtime``: the program compared with, ``note``: why it is not onnxruntime (else empty). ``points``: how many were
+    compared. ``max_abs_err``: the largest difference. ``allowed_err``: the largest difference that the rounding of the
+    program's arithmetic explains at any of the points. ``worst_ratio``: the largest ratio of a difference to what is
+    explained at its own point; above 1 the network was not imported rightly.
+    """
+
+    runtime: str
+    note: str
+    points: int
+    max_abs_err: float
+    allowed_err: float
+    worst_ratio: float
+
+    def problems(self) -> list[str]:
+        """A sentence if the comparison failed, else nothing."""
+        if self.worst_ratio <= 1:
+            return []
+        return [
+            f"the imported network differs from {self.runtime} by {self.max_abs_err:.3g}, {self.worst_ratio:.3g} times "
+            "what rounding explains: the model uses an operator in a way that is read wrongly, or its value at a point "
+            "depends on the other points of a batch"
+        ]
+
+
+def check_parity(model: Model, runtime: Runtime, *, seed: int = 0) -> Parity:
+    """Compare the imported network, in float64 and with its true activations, with ``runtime``.
+
+    Points are uniform in the box, at its corners, and near the level set; they are evaluated in one batch, and some of
+    them again in the small batches `BATCH_SIZES`. The tolerance at each point is the rounding error bound of the IR.
+
+    Raises `CheckFailed` if the runtime stops with an error.
+    """
+    points = probe_points(model, seed=seed)
+    ours = model.evaluate(points)
+    theirs = [runtime.evaluate(points)]
+    chosen = [np.arange(len(points))]
+    start = 0
+    for size in BATCH_SIZES:
+        part = np.arange(start, start + 3 * size)
+        chosen.append(part)
+        theirs.append(runtime.evaluate(points[part], batch=size))
+        start += 3 * size
+    index = np.concatenate(chosen)
+    difference = np.abs(np.concatenate(theirs) - ours[index])
+    # A result that is not a number agrees with nothing.
+    difference[np.isnan(difference)] = np.inf
+    allowed = float32_error_bound(model.imported.network, points)[index]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ratio = np.where(difference == 0, 0.0, difference / allowed)
+    return Parity(
+        runtime.name, runtime.note, len(index), float(difference.max()), float(allowed.max()), float(ratio.max())
+    )
+
+
+def probe_points(model: Model, *, seed: int = 0) -> Floats:
+    """Points of the box, float64 [n, dimension]: uniform, corners, and pairs bisected onto the level set.
+
+    All are rounded to float32 first, so that a runtime of lower precision is fed the same points.
+    """
+    generator = np.random.default_rng(seed)
+    uniform = generator.uniform(model.lower, model.upper, (UNIFORM_POINTS, model.dimension))
+    corners = np.stack(np.meshgrid(*model.bounds, indexing="ij"), axis=-1).reshape(-1, model.dimension)
+    values = evaluate(model.network, uniform)
+    inside, outside = uniform[values < 0], uniform[values >= 0]
+    near = np.empty((0, model.dimension))
+    if len(inside) and len(outside):
+        near = bisect(
+            model,
+            inside[generator.integers(len(inside), size=NEAR_SURFACE_POINTS)],
+            outside[generator.integers(len(outside), size=NEAR_SURFACE_POINTS)],
+        )
+    points = np.concatenate([uniform, near, corners])
+    return points.astype(np.float32).astype(np.float64)
+
+
+def bisect(model: Model, inside: Floats, outside: Floats) -> Floats:
+    """Points close to the level set on the segments from ``inside`` (f < 0) to ``outside``, float64 [n, dimension]."""
+    for _ in range(BISECTIONS):
+        middle = (inside + outside) / 2
+        negative = (evaluate(model.network, middle) < 0)[:, None]
+        inside, outside = np.where(negative, middle, inside), np.where(negative, outside, middle)
+    return inside

@@ -1,0 +1,93 @@
+"""The report of an extraction, ready for JSON.
+
+Its keys:
+
+- ``model``, ``model_sha256``, ``output``, ``level``, ``bounds``, ``threads``, ``versions``: what was extracted, with what;
+- ``exact``, and ``surrogate_eps``: a proved bound on |f_true - f| in the box, zero for exact networks;
+- ``output_range``: the certified range of the piecewise-linear f, which is zero on the level set, in the box;
+- ``polygons``, ``vertices``, ``edges``, ``euler``, ``components``, ``closed`` (every edge inside the box joins two
+  polygons), ``boundary_edges`` (on the box), ``unmatched_edges``, and the other values of `Invariants`;
+- ``max_abs_f``, ``mean_abs_f``, ``ort_mean_abs_f`` and the other values of `Residuals`, null where there was no check or
+  nothing to measure;
+- ``parity_max_abs_err``, ``parity_allowed_err``, ``parity_points``, ``parity_runtime``, ``parity_note``: the comparison
+  of the imported network with onnxruntime, null without checks;
+- ``nodes`` and the other counts of `mn_onnx.extract.schedule.TraversalStatistics`, under ``traversal`` as well;
+- ``seconds``: import, lower, compile (loading or compiling the kernels), traverse, weld, check, write;
+- ``problems``: what failed, ``notes``: what is legal but worth knowing.
+"""
+
+from __future__ import annotations
+
+import platform
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from importlib.metadata import version
+from typing import Any
+
+from mn_onnx import __version__
+from mn_onnx.extract.invariants import Invariants
+from mn_onnx.extract.schedule import TraversalStatistics
+from mn_onnx.model import Model
+from mn_onnx.parity import Parity
+from mn_onnx.residual import Residuals
+
+
+def model_entries(model: Model) -> dict[str, Any]:
+    """The part of a report that tells of the model alone."""
+    return {
+        "model": model.read.name,
+        "model_sha256": model.read.sha256,
+        "output": model.imported.network.output_name,
+        "level": model.level,
+        "bounds": model.bounds.tolist(),
+        "exact": model.exact,
+        "surrogate_eps": model.surrogate_eps,
+        "output_range": list(model.output_range),
+        "versions": versions(),
+    }
+
+
+def check_entries(parity: Parity | None, residuals: Residuals | None) -> dict[str, Any]:
+    """The part of a report that tells of comparisons; null where there were none."""
+    entries: dict[str, Any] = {
+        "parity_runtime": parity.runtime if parity else None,
+        "parity_note": parity.note if parity else None,
+        "parity_points": parity.points if parity else None,
+        "parity_max_abs_err": parity.max_abs_err if parity else None,
+        "parity_allowed_err": parity.allowed_err if parity else None,
+    }
+    measured = asdict(residuals) if residuals else dict.fromkeys(Residuals.__dataclass_fields__)
+    measured["residual_points"] = measured.pop("points")
+    measured["residual_ratio"] = measured.pop("worst_ratio")
+    return entries | measured
+
+
+def build_report(
+    model: Model,
+    *,
+    invariants: Invariants,
+    statistics: TraversalStatistics,
+    parity: Parity | None,
+    residuals: Residuals | None,
+    seconds: Mapping[str, float],
+    problems: Sequence[str],
+    notes: Sequence[str],
+) -> dict[str, Any]:
+    """All entries; see the description of this module."""
+    return {
+        **model_entries(model),
+        **invariants.as_dict(),
+        **check_entries(parity, residuals),
+        "nodes": statistics.nodes,
+        "threads": statistics.threads,
+        "traversal": asdict(statistics),
+        "seconds": dict(seconds),
+        "problems": list(problems),
+        "notes": list(notes),
+    }
+
+
+def versions() -> dict[str, str]:
+    """Versions of this program, of Python and of the packages that decide the result."""
+    packages = {name: version(name) for name in ("numpy", "numba", "onnx", "onnxruntime", "trimesh")}
+    return {"mn-onnx": __version__, "python": platform.python_version(), "platform": platform.platform(), **packages}

@@ -1,0 +1,65 @@
+"""Checks of a mesh file against a model: any mesh, from this program or another."""
+
+from __future__ import annotations
+
+import os
+from typing import Any
+
+import numpy as np
+
+from mn_onnx.errors import UsageError
+from mn_onnx.extract.files import MeshFileError, read_mesh
+from mn_onnx.extract.invariants import check_invariants, mark_box_edges
+from mn_onnx.model import Model
+from mn_onnx.parity import check_parity
+from mn_onnx.report import check_entries, model_entries
+from mn_onnx.residual import measure_residuals
+from mn_onnx.runtime import Runtime
+
+FLOAT32_ROUNDING = float(np.finfo(np.float32).eps) / 2
+
+
+def verify(
+    mesh: str | os.PathLike[str], model: Model, *, tolerance: float | None = None, threads: int | None = None
+) -> dict[str, Any]:
+    """Measure the invariants of a mesh file, and |f - level| on it.
+
+    ``tolerance``: the largest |f| to accept; by default what the rounding of coordinates to float32 explains, which
+    only a mesh of the exact level set meets. ``threads``: all cores by default.
+
+    Returns the entries of `mn_onnx.report` that apply to a file, with ``problems`` (empty if the mesh is right) and
+    ``notes``. Raises `UsageError` if the file cannot be read as a mesh.
+    """
+    try:
+        surface = read_mesh(mesh, threads=threads)
+    except (MeshFileError, OSError) as error:
+        raise UsageError(f"cannot read the mesh {os.fspath(mesh)}: {error}") from error
+    surface = mark_box_edges(surface, model.bounds)
+    invariants = check_invariants(surface, bounds=model.bounds)
+    problems, notes = invariants.problems(), invariants.notes()
+    runtime = Runtime(model.read, model.imported.layout)
+    parity = check_parity(model, runtime)
+    problems += parity.problems()
+    residuals = None
+    if not surface.n_polygons:
+        problems.append("the mesh has no polygons")
+    elif not invariants.area > 0:
+        problems.append("the mesh has no area")
+    else:
+        rounding = FLOAT32_ROUNDING * float(np.abs(surface.vertices).max())
+        residuals = measure_residuals(model, surface, runtime, position_error=rounding)
+        if tolerance is None and residuals.worst_ratio > 1:
+            problems.append(
+                f"|f - level| is up to {residuals.max_abs_f:.3g} on the mesh, {residuals.worst_ratio:.3g} times "
+                "what the rounding of its coordinates explains: it is not the exact level set"
+            )
+        elif tolerance is not None and residuals.max_abs_f > tolerance:
+            problems.append(f"|f - level| is up to {residuals.max_abs_f:.3g} on the mesh, more than {tolerance:g}")
+    return {
+        "mesh": os.fspath(mesh),
+        **model_entries(model),
+        **invariants.as_dict(),
+        **check_entries(parity, residuals),
+        "problems": problems,
+        "notes": notes,
+    }

@@ -1,0 +1,26 @@
+"""Compiles the kernels, or loads them from numba's cache, on a tiny network: so that this time is measured apart."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from mn_onnx.extract.invariants import check_invariants
+from mn_onnx.extract.sampling import sample_surface
+from mn_onnx.extract.schedule import traverse
+from mn_onnx.extract.weld import weld
+from mn_onnx.ir.network import AffineRow, KnotTable, Network, Unit
+
+
+def warm_up(dimension: int) -> None:
+    """Extract |x_0| + ... = 1 / 2, which goes once through every kernel."""
+    one = np.ones(1)
+    table = KnotTable.exact([0.0], [[-1.0, 1.0]], [[0.0, 0.0]])
+    units = tuple(
+        Unit(AffineRow(np.array([axis]), one, 0.0), (table,), f"|x_{axis}|", table) for axis in range(dimension)
+    )
+    total = AffineRow(np.arange(dimension, 2 * dimension), np.ones(dimension), -0.5)
+    network = Network(dimension, units, total)
+    soup, _ = traverse(network, -np.ones(dimension), np.ones(dimension), threads=1)
+    surface = weld(soup, threads=1)
+    check_invariants(surface)
+    sample_surface(surface, 1)
