@@ -67,7 +67,7 @@ class KnotTable:
 
     @property
     def n_outputs(self) -> int:
-        return self.slopes.shape[0]
+        return int(self.slopes.shape[0])
 
     def evaluate(self, t: Floats) -> Floats:
         """Values [o, *t.shape] at ``t``; a knot belongs to the interval on its right."""

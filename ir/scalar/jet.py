@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -215,7 +216,7 @@ def _logic(op: str, arguments: list[Truth]) -> Truth:
     return Truth(first.certain | second.certain, first.possible | second.possible)
 
 
-ARITHMETIC = {
+ARITHMETIC: dict[str, Callable[..., Jet]] = {
     "add": _add,
     "subtract": _subtract,
     "multiply": _multiply,

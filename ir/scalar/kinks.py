@@ -43,7 +43,8 @@ def halve(lower: Floats, upper: Floats) -> tuple[Floats, Floats]:
 def is_finest(lower: Floats, upper: Floats, whole_range: float) -> np.ndarray:
     """Whether intervals are too narrow to be divided, in float64 or beside the range they are part of."""
     resolution = FINEST_ULPS * np.spacing(np.maximum(np.abs(lower), np.abs(upper)))
-    return upper - lower <= np.maximum(resolution, FINEST_FRACTION * whole_range)
+    finest: np.ndarray = upper - lower <= np.maximum(resolution, FINEST_FRACTION * whole_range)
+    return finest
 
 
 def _switches(expression: Expression) -> Iterator[Expression]:

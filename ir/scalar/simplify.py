@@ -41,7 +41,8 @@ def _table(function: Piecewise) -> KnotTable | None:
             return None
     knots: list[float] = []
     pieces = [function.pieces[0]]
-    for knot, piece in zip((float(knot) for knot in function.knots), function.pieces[1:], strict=True):
+    for exact_knot, piece in zip(function.knots, function.pieces[1:], strict=True):
+        knot = float(exact_knot)
         if knots and knot == knots[-1]:
             # Two knots in one double: the piece between them is narrower than the rounding of t.
             pieces[-1] = piece
