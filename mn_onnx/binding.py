@@ -48,13 +48,17 @@ def graph_inputs(model: onnx.ModelProto) -> list[GraphInput]:
         if not value.type.HasField("tensor_type") or not kind.HasField("shape"):
             problems.append(_problem(value.name, "the input is not a tensor of known rank", "export it as a tensor"))
             continue
-        sizes = [axis.dim_value if axis.HasField("dim_value") and axis.dim_value > 0 else None for axis in kind.shape.dim]
+        sizes = [
+            axis.dim_value if axis.HasField("dim_value") and axis.dim_value > 0 else None for axis in kind.shape.dim
+        ]
         dtype = np.dtype(onnx.helper.tensor_dtype_to_np_dtype(kind.elem_type))
         inputs.append(GraphInput(value.name, dtype, tuple(sizes), tuple(axis.dim_param for axis in kind.shape.dim)))
     if problems:
         raise ModelRefused(problems)
     if not inputs:
-        raise ModelRefused([_problem("", "the graph has no inputs: it is a constant", "export it with the points as input")])
+        raise ModelRefused(
+            [_problem("", "the graph has no inputs: it is a constant", "export it with the points as input")]
+        )
     return inputs
 
 
@@ -66,8 +70,9 @@ def bind_inputs(
     """The role of every input, and the dimension of the points.
 
     ``bind``: constants by input name (broadcast to the input's shape), or by columns of the point input: ``x[3]``,
-    ``x[0:8]``, ``x[0,2]``, also counted from the end. ``coordinates``: the coordinates in order, as columns of the point
-    input, or as names of inputs or ``name[column]``; by default, all columns that are not bound, input after input.
+    ``x[0:8]``, ``x[0,2]``, also counted from the end. ``coordinates``: the coordinates in order, as columns of the
+    point input, or as names of inputs or ``name[column]``; by default, all columns that are not bound, input after
+    input.
 
     Raises `UsageError` for names, columns or values that do not fit, `ModelRefused` if roles stay open.
     """
@@ -159,7 +164,9 @@ def _only_point_input(
 ) -> str:
     highest = max(c for c in coordinates if not isinstance(c, str))
     open_ = [name for name in by_name if name not in values] or list(by_name)
-    fitting = [name for name in open_ if (by_name[name].shape[coordinate_axis(by_name[name], wide=True) or 0] or 0) > highest]
+    fitting = [
+        name for name in open_ if (by_name[name].shape[coordinate_axis(by_name[name], wide=True) or 0] or 0) > highest
+    ]
     if len(fitting) != 1:
         raise UsageError("name the input of each coordinate, as in 'points[0]', as several inputs are not bound")
     return fitting[0]
@@ -202,7 +209,13 @@ def _bound_input(entry: GraphInput, value: np.ndarray) -> BoundInput:
 
 
 def _show(entry: GraphInput) -> str:
-    return "[" + ", ".join(name or "?" if size is None else str(size) for size, name in zip(entry.shape, entry.free, strict=True)) + "]"
+    return (
+        "["
+        + ", ".join(
+            name or "?" if size is None else str(size) for size, name in zip(entry.shape, entry.free, strict=True)
+        )
+        + "]"
+    )
 
 
 def _arrange(
@@ -237,7 +250,9 @@ def _arrange(
         if isinstance(shape, Problem):
             problems.append(shape)
             continue
-        numbers = {column: order.index((entry.name, column)) if order else next_coordinate + i for i, column in enumerate(free)}
+        numbers = {
+            column: order.index((entry.name, column)) if order else next_coordinate + i for i, column in enumerate(free)
+        }
         next_coordinate += len(free)
         arranged[entry.name] = PointInput(
             entry.name, entry.dtype, shape, axis,
@@ -254,7 +269,9 @@ def _remaining_values(entry: GraphInput, width: int, special: _Columns, value: n
     open_ = [c for c in range(width) if c not in special.bound and c not in (special.chosen or [])]
     flat = np.asarray(value, np.float64).reshape(-1)
     if flat.size != len(open_):
-        raise UsageError(f"{flat.size} values for the {len(open_)} columns of input {entry.name!r} that are no coordinates")
+        raise UsageError(
+            f"{flat.size} values for the {len(open_)} columns of input {entry.name!r} that are no coordinates"
+        )
     return dict(zip(open_, flat.tolist(), strict=True))
 
 
@@ -276,16 +293,20 @@ def _shape_per_point(entry: GraphInput, axis: int | None) -> tuple[int | None, .
 def _role_problems(
     points: Sequence[GraphInput], arranged: Mapping[str, PointInput], dim: int, order: list[tuple[str, int]] | None
 ) -> list[Problem]:
+    if order is None and len(points) > 1 and not _splits_coordinates(points, arranged, dim):
+        return _unbound_inputs(points, arranged)
     counts = {point_count(role.shape, role.axis) for role in arranged.values()}
     if len(counts) > 1:
         return [_problem("", f"its point inputs hold different numbers of points: {counts}", "bind all but the points")]
-    if order is None and len(points) > 1 and not _splits_coordinates(points, arranged, dim):
-        return _unbound_inputs(points, arranged)
     if not 1 <= dim <= MAX_DIM:
         entry = points[0]
         if dim > MAX_DIM and len(points) == 1:
-            return [_unbound_columns(entry, [c for c, number in enumerate(arranged[entry.name].columns) if number >= 0])]
-        return [_problem("", f"{dim} coordinates are left; supported are 1 to {MAX_DIM}", "bind the others to constants")]
+            return [
+                _unbound_columns(entry, [c for c, number in enumerate(arranged[entry.name].columns) if number >= 0])
+            ]
+        return [
+            _problem("", f"{dim} coordinates are left; supported are 1 to {MAX_DIM}", "bind the others to constants")
+        ]
     return []
 
 
@@ -326,6 +347,6 @@ def _integer_input(entry: GraphInput) -> Problem:
     return _problem(
         entry.name,
         f"input of type {entry.dtype.name} and shape {_show(entry)} is not bound; coordinates are real numbers",
-        f"bind it if it is an index or an option: --bind {entry.name}=VALUE; a model of integer coordinates or tokens has "
-        "no level set",
+        f"bind it if it is an index or an option: --bind {entry.name}=VALUE; a model of integer coordinates or tokens "
+        "has no level set",
     )

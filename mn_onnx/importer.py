@@ -17,9 +17,18 @@ from mn_onnx.errors import ModelRefused, Problem, UsageError
 from mn_onnx.ir.network import AffineRow, Network, Unit
 from mn_onnx.layout import BoundInput, Layout, Output, PointInput, point_count
 from mn_onnx.lowering import LOWERINGS, REFUSALS
-from mn_onnx.lowering.context import Context, GraphValue
+from mn_onnx.lowering.context import Context, GraphValue, Scope
 from mn_onnx.structure import opset_versions
-from mn_onnx.symbolic import CONSTANT, IDENTITY, NO_POINT, SIZE_LIMIT, Constant, Opaque, Tensor, check_size, is_float, lift
+from mn_onnx.symbolic import (
+    CONSTANT,
+    NO_POINT,
+    Constant,
+    Opaque,
+    Tensor,
+    check_size,
+    is_float,
+    lift,
+)
 from mn_onnx.symbolic_store import Store
 
 FREE_BATCHES = (2, 5)
@@ -112,7 +121,7 @@ def _with_free_batch(layout: Layout) -> Layout:
 
 def _run(model: onnx.ModelProto, layout: Layout, n: int, output: str | None, channel: int | None) -> _Run:
     context = Context(Store(layout.dim), opset_versions(model), LOWERINGS, REFUSALS)
-    scope = {entry.name: _input_value(entry, n) for entry in layout.inputs}
+    scope: Scope = {entry.name: _input_value(entry, n) for entry in layout.inputs}
     names = [value.name for value in model.graph.output]
     values = dict(zip(names, context.run_graph(model.graph, scope), strict=True))
     chosen = _choose_output(context, values, n, output)
@@ -174,7 +183,13 @@ def _choose_output(context: Context, values: Mapping[str, GraphValue], n: int, o
             raise ModelRefused([context.problems[number] for number in problems])
     shown = ", ".join(repr(name) for name in candidates or values)
     raise ModelRefused(
-        [_problem("", f"several outputs could be the field: {shown}", f"choose one: --output {(candidates or list(values))[0]}")]
+        [
+            _problem(
+                "",
+                f"several outputs could be the field: {shown}",
+                f"choose one: --output {(candidates or list(values))[0]}",
+            )
+        ]
     )
 
 
@@ -195,7 +210,7 @@ def _choose_channel(
     if axis is None and (n > 1 or tensor.size == 0):
         if problems := context.problems_of(tensor):
             raise ModelRefused([context.problems[number] for number in sorted(problems)])
-        raise ModelRefused([_shape_problem(context, name, tensor, n)])
+        raise ModelRefused([_shape_problem(name, tensor, n)])
     rows = tensor.reshape(1, -1) if axis is None else tensor.map(lambda f: np.moveaxis(f, axis, 0))
     rows = rows.reshape(n, tensor.size // n)
     width = rows.shape[1]
@@ -222,7 +237,7 @@ def _point_axis(tensor: Tensor, n: int) -> int | None:
     return None
 
 
-def _shape_problem(context: Context, name: str, tensor: Tensor, n: int) -> Problem:
+def _shape_problem(name: str, tensor: Tensor, n: int) -> Problem:
     live = tensor.live
     if live.any() and len(np.unique(tensor.point[live])) < n:
         reason = f"its shape {list(tensor.shape)} for {n} points does not give every point values of its own"
@@ -258,8 +273,8 @@ def _network(run: _Run, dim: int) -> Network:
         variable = pending.pop()
         if variable >= dim and variable not in needed:
             needed.add(variable)
-            base, _ = store.units[variable - dim]
-            pending += store.directions[store.bases[base].direction][0].tolist()
+            base = store.bases[store.units[variable - dim][0]]
+            pending += store.directions[base.direction][0].tolist()
     ordered = sorted(needed)
     number = {variable: variable for variable in range(dim)} | {v: dim + i for i, v in enumerate(ordered)}
 
@@ -272,9 +287,7 @@ def _network(run: _Run, dim: int) -> Network:
         key = store.units[variable - dim]
         base = store.bases[key[0]]
         columns, weights = store.directions[base.direction]
-        units.append(
-            Unit(row(columns, weights * base.scale, base.shift), (store.functions[key[1]],), store.names[key])
-        )
+        units.append(Unit(row(columns, weights * base.scale, base.shift), (store.functions[key[1]],), store.names[key]))
     result = row(rows.columns, rows.matrix[0], rows.constants[0])
     return Network(dim, tuple(units), result, run.output.name)
 

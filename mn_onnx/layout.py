@@ -1,4 +1,4 @@
-"""How points enter a model and values leave it: coordinate axes and columns, bound inputs, the chosen output channel."""
+"""How points enter a model and values leave it: coordinate axes and columns, bound inputs, the output channel."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ Feeds = dict[str, np.ndarray]
 class PointInput:
     """An input that holds coordinates.
 
-    ``shape``: sizes of its axes, None for the axis that counts the points. ``axis``: the axis of the columns, None if the
-    input is one coordinate without such an axis. ``columns``: the coordinate in each column, -1 for a bound one, whose
-    number is in ``values`` (float64, one per column).
+    ``shape``: sizes of its axes, None for the axis that counts the points. ``axis``: the axis of the columns, None if
+    the input is one coordinate without such an axis. ``columns``: the coordinate in each column, -1 for a bound one,
+    whose number is in ``values`` (float64, one per column).
     """
 
     name: str
@@ -41,7 +41,7 @@ class PointInput:
 
 @dataclass(frozen=True, eq=False)
 class BoundInput:
-    """An input that is bound to constants: ``value``, broadcast to ``shape`` (None where it is as long as the batch)."""
+    """An input bound to constants: ``value``, broadcast to ``shape`` (None where it is as long as the batch)."""
 
     name: str
     dtype: np.dtype

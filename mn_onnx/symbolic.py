@@ -10,11 +10,12 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-Array = NDArray[np.generic]
+Array = NDArray[Any]
 
 NO_POINT = -1
 CONSTANT = -1
@@ -100,8 +101,7 @@ class Tensor:
 
     def map(self, change: Callable[[Array], Array]) -> Tensor:
         """Apply the same rearrangement to all fields."""
-        fields = (self.point, self.base, self.function, self.scale, self.offset)
-        return Tensor(*(change(field) for field in fields), dtype=self.dtype)  # type: ignore[arg-type]
+        return join([self], lambda fields: change(fields[0]))
 
     def take(self, index: NDArray[np.int64]) -> Tensor:
         """The elements at flat positions ``index``, in its shape."""
@@ -150,6 +150,18 @@ def lower(tensor: Tensor) -> Constant | Tensor:
     return Constant(tensor.offset.astype(tensor.dtype), tensor.dtype)
 
 
+def join(tensors: Sequence[Tensor], combine: Callable[[list[Array]], Array]) -> Tensor:
+    """Combine tensors field by field into one of the type of the first; ``combine`` must treat all fields alike."""
+    return Tensor(
+        combine([tensor.point for tensor in tensors]),
+        combine([tensor.base for tensor in tensors]),
+        combine([tensor.function for tensor in tensors]),
+        combine([tensor.scale for tensor in tensors]),
+        combine([tensor.offset for tensor in tensors]),
+        tensors[0].dtype,
+    )
+
+
 def rearrange(value: Constant | Tensor, change: Callable[[Array], Array]) -> Constant | Tensor:
     """Move elements by ``change``, a function of numpy arrays that only reorders, repeats or drops elements."""
     if isinstance(value, Constant):
@@ -164,9 +176,7 @@ def concatenate(values: Sequence[Constant | Tensor], axis: int) -> Constant | Te
     check_size((sum(math.prod(value.shape) for value in values),))
     if all(isinstance(value, Constant) for value in values):
         return Constant(np.concatenate([value.array for value in values], axis), dtype)  # type: ignore[union-attr]
-    tensors = [lift(value) for value in values]
-    fields = zip(*((t.point, t.base, t.function, t.scale, t.offset) for t in tensors), strict=True)
-    return Tensor(*(np.concatenate(field, axis) for field in fields), dtype=dtype)
+    return join([lift(value) for value in values], lambda fields: np.concatenate(fields, axis))
 
 
 def groups(*keys: Array) -> tuple[NDArray[np.int64], NDArray[np.int64]]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from mn_onnx.symbolic import CONSTANT, NO_POINT, Constant, Tensor, check_size, lift
+from mn_onnx.symbolic import CONSTANT, NO_POINT, Constant, Tensor, check_size, join, lift
 from mn_onnx.symbolic_algebra import Algebra
 from mn_onnx.symbolic_store import Rows
 
@@ -44,11 +44,11 @@ def contract(algebra: Algebra, x: Tensor, weights: Floats, bias: Floats | None =
                 if points.size > 1 and base[first, column] >= CONSTANT:
                     base[members, column] = algebra.refuse_mixing()
     point[base == CONSTANT] = NO_POINT
-    return Tensor(point, base, function, scale, offset, x.dtype)  # type: ignore[arg-type]
+    return Tensor(point, base, function, scale, offset, x.dtype)
 
 
 def _alike(x: Tensor, lone: NDArray[np.bool_]) -> list[NDArray[np.int64]]:
-    """Groups of rows [r, k] with equal functions; rows that mix points (not ``lone``) stay apart unless wholly equal."""
+    """Groups of rows [r, k] with equal functions; rows that mix points (not ``lone``) must be wholly equal."""
     r = x.shape[0]
     fields = (x.base, x.function, x.scale, x.offset)
     if r and lone.all() and all((field == field[0]).all() for field in fields):
@@ -121,8 +121,7 @@ def _product_with_constant(
     left = x.broadcast((*batch, m, k)).reshape(-1, m, k)
     right = np.broadcast_to(weights, (*batch, k, n)).reshape(-1, k, n)
     parts = [contract(algebra, left.map(lambda f, i=i: f[i]), right[i], bias) for i in range(len(right))]  # type: ignore[misc]
-    fields = zip(*((p.point, p.base, p.function, p.scale, p.offset) for p in parts), strict=True)
-    return Tensor(*(np.stack(field) for field in fields), dtype=x.dtype).reshape(*batch, m, n)
+    return join(parts, np.stack).reshape(*batch, m, n)
 
 
 def _product_of_tensors(algebra: Algebra, x: Tensor, y: Tensor, bias: Floats | None, shape: tuple[int, ...]) -> Tensor:

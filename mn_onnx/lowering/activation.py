@@ -55,7 +55,7 @@ def _leaky_with_constant(x: Expression, slope: Expression) -> Expression:
 def clip_by_attributes(context: Context, node: Node) -> Tensor:
     """Clip before opset 11."""
     lowest, highest = number(node, "min", -math.inf), number(node, "max", math.inf)
-    return _clip(context, node, lowest, highest)
+    return _clip(context, lift(node.tensor(0)), lowest, highest)
 
 
 def clip_by_inputs(context: Context, node: Node) -> Tensor:
@@ -70,20 +70,20 @@ def clip_by_inputs(context: Context, node: Node) -> Tensor:
         else:
             x = context.algebra.extremum(x, bound, operation)
             bounds.append(default)
-    return _clip(context, node, *bounds, x=x)
+    return _clip(context, x, bounds[0], bounds[1])
 
 
-def _clip(context: Context, node: Node, lowest: float, highest: float, x: Tensor | None = None) -> Tensor:
+def _clip(context: Context, x: Tensor, lowest: float, highest: float) -> Tensor:
     # Exporters write the largest float32 for "no bound".
     lowest = -math.inf if lowest <= -FLOAT32_MAX else lowest
     highest = math.inf if highest >= FLOAT32_MAX else highest
-    tensor = lift(node.tensor(0)) if x is None else x
     if lowest == -math.inf and highest == math.inf:
-        return tensor
-    return context.algebra.unary(tensor, lambda e: formulas.clip(e, lowest, highest))
+        return x
+    return context.algebra.unary(x, lambda e: formulas.clip(e, lowest, highest))
 
 
 def gelu(node: Node, x: Expression) -> Expression:
+    """Gelu: exact, or by tanh if ``approximate`` says so."""
     approximate = node.attribute("approximate", "none")
     if approximate not in ("none", "tanh"):
         raise UnsupportedNode(f"approximate={approximate!r} is not defined; 'none' and 'tanh' are")
@@ -96,10 +96,13 @@ def is_never(_context: Context, node: Node) -> Constant:
 
 
 def absolute(context: Context, node: Node) -> Tensor:
+    """Abs."""
     return context.algebra.unary(lift(node.tensor(0)), lambda x: apply("abs", x))
 
 
 def rounding(operation: str) -> Sequence[Lowering]:
+    """The entry of Floor, Ceil or Round, which leave integers as they are."""
+
     def lower(context: Context, node: Node) -> Constant | Tensor:
         x = node.tensor(0)
         if not is_float(x.dtype):

@@ -20,6 +20,8 @@ TRUE, FALSE = constant(1.0), constant(0.0)
 
 
 def binary(operation: Binary) -> Callable[[Context, Node], Tensor]:
+    """The lowering of an operator of two tensors."""
+
     def lower(context: Context, node: Node) -> Tensor:
         return operation(context.algebra, lift(node.tensor(0)), lift(node.tensor(1)))
 
@@ -45,6 +47,7 @@ def balanced(operands: list[Tensor], join: Callable[[Tensor, Tensor], Tensor]) -
 
 
 def divide(context: Context, node: Node) -> Tensor:
+    """Div of real numbers."""
     x, y = lift(node.tensor(0)), lift(node.tensor(1))
     if not is_float(x.dtype):
         raise UnsupportedNode("it divides integers that depend on the points, which rounds")
@@ -52,15 +55,18 @@ def divide(context: Context, node: Node) -> Tensor:
 
 
 def mean(context: Context, node: Node) -> Tensor:
+    """Mean of any number of tensors."""
     total = n_ary(Algebra.add)(context, node)
     return context.algebra.divide(total, lift(Constant.of(np.float64(len(node.inputs)))))  # type: ignore[arg-type]
 
 
 def negate(context: Context, node: Node) -> Tensor:
+    """Neg."""
     return context.algebra.multiply(lift(node.tensor(0)), lift(Constant.of(np.asarray(-1.0))))
 
 
 def power(context: Context, node: Node) -> Tensor:
+    """Pow with a constant exponent, or a positive constant base."""
     x, exponent = lift(node.tensor(0)), lift(node.tensor(1))
     if exponent.refused.any() or x.refused.any():
         return context.algebra.apply([x, exponent], _power)
@@ -82,6 +88,7 @@ def _power(x: Expression, exponent: Expression) -> Expression:
 
 
 def modulo(context: Context, node: Node) -> Tensor:
+    """Mod, with the sign of the divisor or, with ``fmod``, of the dividend."""
     like_c = bool(node.attribute("fmod", 0))
     return context.algebra.apply(
         [lift(node.tensor(0)), lift(node.tensor(1))], lambda x, y: formulas.remainder(x, y, like_c)
@@ -89,6 +96,8 @@ def modulo(context: Context, node: Node) -> Tensor:
 
 
 def comparison(operation: str, *, swap: bool = False) -> Callable[[Context, Node], Tensor]:
+    """The lowering of a comparison; ``swap`` exchanges the operands."""
+
     def lower(context: Context, node: Node) -> Tensor:
         x, y = lift(node.tensor(0)), lift(node.tensor(1))
         return context.algebra.compare(y, x, operation) if swap else context.algebra.compare(x, y, operation)
@@ -97,10 +106,13 @@ def comparison(operation: str, *, swap: bool = False) -> Callable[[Context, Node
 
 
 def where(context: Context, node: Node) -> Tensor:
+    """Where."""
     return context.algebra.where(lift(node.tensor(0)), lift(node.tensor(1)), lift(node.tensor(2)))
 
 
 def connective(build: Callable[..., Expression], n: int) -> Callable[[Context, Node], Tensor]:
+    """The lowering of a logical operator of ``n`` tensors."""
+
     def lower(context: Context, node: Node) -> Tensor:
         return context.algebra.apply([lift(node.tensor(i)) for i in range(n)], build, BOOL)
 
@@ -108,18 +120,21 @@ def connective(build: Callable[..., Expression], n: int) -> Callable[[Context, N
 
 
 def conjunction(p: Expression, q: Expression) -> Expression:
+    """``p and q``."""
     if p.op == "constant":
         return q if p.value else FALSE
     return conjunction(q, p) if q.op == "constant" else apply("and", p, q)
 
 
 def disjunction(p: Expression, q: Expression) -> Expression:
+    """``p or q``."""
     if p.op == "constant":
         return TRUE if p.value else q
     return disjunction(q, p) if q.op == "constant" else apply("or", p, q)
 
 
 def negation(p: Expression) -> Expression:
+    """``not p``."""
     return constant(float(not p.value)) if p.op == "constant" else apply("not", p)
 
 
@@ -129,6 +144,7 @@ def difference(p: Expression, q: Expression) -> Expression:
 
 
 def cast(context: Context, node: Node) -> Constant | Tensor:
+    """Cast to the type in the attribute ``to``."""
     target = node.attribute("to")
     # Before opset 6 the type is given by name.
     code = onnx.TensorProto.DataType.Value(target) if isinstance(target, str) else int(target)
@@ -138,6 +154,7 @@ def cast(context: Context, node: Node) -> Constant | Tensor:
 
 
 def cast_like(context: Context, node: Node) -> Constant | Tensor:
+    """Cast to the type of the second input."""
     return convert(context, node.tensor(0), node.tensor(1).dtype)
 
 

@@ -14,7 +14,7 @@ from mn_onnx.lowering.fold import fold
 from mn_onnx.lowering.node import Node, OpaqueInput, UnsupportedNode, decode_attributes, read_tensor
 from mn_onnx.lowering.table import Lowering, Refusal
 from mn_onnx.structure import node_label
-from mn_onnx.symbolic import CONSTANT, Constant, Opaque, Tensor, lower
+from mn_onnx.symbolic import CONSTANT, Constant, Opaque, Tensor, TooLargeError, lower
 from mn_onnx.symbolic_algebra import Algebra
 from mn_onnx.symbolic_store import Store
 
@@ -28,7 +28,7 @@ STEP_LIMIT = 100_000
 class Context:
     """The state of one run: the store, the problems so far, and the values in scope.
 
-    ``lowerings`` and ``refusals`` map ``(domain, operator)``; ``opsets`` maps domains to the versions that are imported.
+    ``lowerings`` and ``refusals`` map ``(domain, operator)``; ``opsets`` maps domains to the imported versions.
     """
 
     def __init__(
@@ -124,6 +124,8 @@ class Context:
             return self._opaque(node, frozenset())
         except UnsupportedNode as error:
             return self._opaque(node, frozenset({self.report(node, error.reason, error.remedy)}))
+        except TooLargeError as error:
+            return self._opaque(node, frozenset({self.report(node, str(error), "export with fewer points at once")}))
         except (ArithmeticError, IndexError, KeyError, TypeError, ValueError) as error:
             reason = f"it cannot be evaluated: {error}"
             return self._opaque(node, frozenset({self.report(node, reason, "check the model with onnx.checker")}))

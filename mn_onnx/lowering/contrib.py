@@ -54,11 +54,13 @@ def fused_activation(node: Node, x: Expression) -> Expression:
 
 
 def fused_gemm(context: Context, node: Node) -> Tensor:
+    """Gemm followed by an activation."""
     product = linear.gemm(context, node)
     return context.algebra.unary(lift(product), lambda x: fused_activation(node, x))
 
 
 def fused_convolution(context: Context, node: Node) -> Tensor:
+    """Convolution, an optional summand, and an activation."""
     plain = dataclasses.replace(node, inputs=node.inputs[:3])
     result = linear.convolution(context, plain)
     if node.has(3):
@@ -76,7 +78,7 @@ def fused_matmul(context: Context, node: Node) -> Tensor:
         if node.attribute(f"trans{letter}", 0) and len(x.shape) > 1:
             x = rearrange(x, lambda array: np.swapaxes(array, -1, -2))
         operands.append(x)
-    return linear.scaled(context, matmul(context.algebra, *operands), number(node, "alpha", 1.0))
+    return linear.scaled(context, matmul(context.algebra, operands[0], operands[1]), number(node, "alpha", 1.0))
 
 
 def biased(formula: Callable[[Expression], Expression]) -> Callable[[Context, Node], Tensor]:
@@ -101,6 +103,7 @@ def scaler(context: Context, node: Node) -> Tensor:
 
 
 def linear_regressor(context: Context, node: Node) -> Tensor:
+    """``x @ coefficients.T + intercepts``."""
     x = lift(node.tensor(0)).with_dtype(FLOAT32)
     transform = node.attribute("post_transform", "NONE")
     if transform != "NONE":
@@ -120,6 +123,7 @@ def array_feature_extractor(_context: Context, node: Node) -> Constant | Tensor:
 
 
 def binarizer(context: Context, node: Node) -> Tensor:
+    """One above the threshold, else zero."""
     threshold = constant(number(node, "threshold", 0.0))
     return context.algebra.unary(lift(node.tensor(0)), lambda x: formulas.truth_as_number(apply("less", threshold, x)))
 

@@ -114,31 +114,37 @@ def _position(node: Node, index: int, size: int) -> int:
 
 
 def sequence_construct(_context: Context, node: Node) -> tuple[list[GraphValue]]:
+    """A sequence of the inputs."""
     return (list(map(_given, node.inputs)),)
 
 
 def sequence_insert(_context: Context, node: Node) -> tuple[list[GraphValue]]:
+    """A sequence with one more tensor, at the end by default."""
     items = list(_sequence(node))
     items.insert(_position(node, 2, len(items)) if node.has(2) else len(items), node.tensor(1))
     return (items,)
 
 
 def sequence_erase(_context: Context, node: Node) -> tuple[list[GraphValue]]:
+    """A sequence without one tensor, the last by default."""
     items = list(_sequence(node))
     del items[_position(node, 1, len(items)) if node.has(1) else -1]
     return (items,)
 
 
 def sequence_at(_context: Context, node: Node) -> GraphValue:
+    """The tensor at a position."""
     items = _sequence(node)
     return items[_position(node, 1, len(items))]
 
 
 def sequence_length(_context: Context, node: Node) -> Constant:
+    """How many tensors there are."""
     return Constant(np.asarray(len(_sequence(node)), np.int64), INT64)
 
 
 def split_to_sequence(_context: Context, node: Node) -> tuple[list[GraphValue]]:
+    """Parts of given sizes, or slices of one element, as a sequence."""
     x = node.tensor(0)
     axis = normal_axis(int(node.attribute("axis", 0)), len(x.shape))
     sizes, single = [1] * x.shape[axis], not node.has(1)
@@ -157,6 +163,7 @@ def split_to_sequence(_context: Context, node: Node) -> tuple[list[GraphValue]]:
 
 
 def concat_from_sequence(_context: Context, node: Node) -> GraphValue:
+    """The tensors of a sequence, joined or stacked along an axis."""
     items, axis = _sequence(node), int(node.attribute("axis"))
     if node.attribute("new_axis", 0):
         return _stacked(items, axis)

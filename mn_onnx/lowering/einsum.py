@@ -19,6 +19,7 @@ Operand = tuple[str, Constant | Tensor]
 
 
 def einsum(context: Context, node: Node) -> Constant | Tensor:
+    """Einsum, two operands at a time."""
     tensors = [node.tensor(index) for index in range(len(node.inputs))]
     terms, output = parse(str(node.attribute("equation", "")), [len(tensor.shape) for tensor in tensors])
     operands = [diagonal(term, tensor) for term, tensor in zip(terms, tensors, strict=True)]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 from typing import Any
 
 import numpy as np
@@ -14,6 +13,17 @@ import onnx.reference
 from mn_onnx.lowering.node import Node, UnsupportedNode
 from mn_onnx.symbolic import Constant, check_size, is_float
 
+_FAILURES = (
+    ArithmeticError,
+    AssertionError,
+    AttributeError,
+    LookupError,
+    MemoryError,
+    RuntimeError,
+    TypeError,
+    ValueError,
+)
+
 
 def fold(node: Node) -> tuple[Constant, ...]:
     """The outputs of a node with constant inputs, real numbers in float64.
@@ -22,11 +32,9 @@ def fold(node: Node) -> tuple[Constant, ...]:
     """
     given = {name: value for name, value in zip(node.proto.input, node.inputs, strict=False) if name}
     arrays = {name: value.array for name, value in given.items() if isinstance(value, Constant)}
-    # Operators on several tensors broadcast them: the result must stay of a sane size.
-    with contextlib.suppress(ValueError):
-        check_size(np.broadcast_shapes(*(array.shape for array in arrays.values())))
-    for array in arrays.values():
-        check_size(array.shape)
+    shapes = [array.shape for array in arrays.values()]
+    for shape in (*shapes, _joint_shape(shapes)):
+        check_size(shape)
     names = [name for name in node.proto.output if name]
     try:
         evaluator = onnx.reference.ReferenceEvaluator(_model(node, list(arrays), names))
@@ -38,6 +46,14 @@ def fold(node: Node) -> tuple[Constant, ...]:
     real = next((v.dtype for v in given.values() if isinstance(v, Constant) and is_float(v.dtype)), None)
     by_name = dict(zip(names, (_constant(result, real) for result in results), strict=True))
     return tuple(by_name.get(name, Constant(np.zeros(0), np.dtype(np.float32))) for name in node.proto.output)
+
+
+def _joint_shape(shapes: list[tuple[int, ...]]) -> tuple[int, ...]:
+    """The shape to which an elementwise operator would broadcast its inputs; empty if it cannot."""
+    try:
+        return np.broadcast_shapes(*shapes)
+    except ValueError:
+        return ()
 
 
 def _model(node: Node, inputs: list[str], outputs: list[str]) -> onnx.ModelProto:

@@ -10,6 +10,7 @@ ZERO, ONE = constant(0.0), constant(1.0)
 
 
 def add(*terms: Expression) -> Expression:
+    """The sum of terms."""
     total = terms[0]
     for term in terms[1:]:
         total = apply("add", total, term)
@@ -17,18 +18,22 @@ def add(*terms: Expression) -> Expression:
 
 
 def times(factor: float, x: Expression) -> Expression:
+    """``factor * x``."""
     return x if factor == 1.0 else apply("multiply", constant(factor), x)
 
 
 def positive_part(x: Expression) -> Expression:
+    """``max(x, 0)``."""
     return apply("maximum", x, ZERO)
 
 
 def negative_part(x: Expression) -> Expression:
+    """``min(x, 0)``."""
     return apply("minimum", x, ZERO)
 
 
 def leaky(x: Expression, slope: float) -> Expression:
+    """``x`` above zero, ``slope * x`` below."""
     return positive_part(x) if slope == 0.0 else add(positive_part(x), times(slope, negative_part(x)))
 
 
@@ -46,38 +51,47 @@ def expm1_of_negative_part(x: Expression, rate: float) -> Expression:
 
 
 def elu(x: Expression, alpha: float) -> Expression:
+    """``x`` above zero, ``alpha (e^x - 1)`` below."""
     return add(positive_part(x), times(alpha, expm1_of_negative_part(x, 1.0)))
 
 
 def selu(x: Expression, alpha: float, gamma: float) -> Expression:
+    """``gamma`` times `elu`."""
     return times(gamma, elu(x, alpha))
 
 
 def celu(x: Expression, alpha: float) -> Expression:
+    """``x`` above zero, ``alpha (e^(x/alpha) - 1)`` below."""
     return add(positive_part(x), times(alpha, expm1_of_negative_part(x, alpha)))
 
 
 def hard_sigmoid(x: Expression, alpha: float, beta: float) -> Expression:
+    """``alpha x + beta`` between zero and one."""
     return clip(add(times(alpha, x), constant(beta)), 0.0, 1.0)
 
 
 def hard_swish(x: Expression) -> Expression:
+    """``x`` times `hard_sigmoid` with slope 1/6."""
     return apply("multiply", x, hard_sigmoid(x, 1.0 / 6.0, 0.5))
 
 
 def swish(x: Expression, rate: float) -> Expression:
+    """``x sigmoid(rate x)``."""
     return apply("multiply", x, apply("sigmoid", times(rate, x)))
 
 
 def mish(x: Expression) -> Expression:
+    """``x tanh(softplus(x))``."""
     return apply("multiply", x, apply("tanh", apply("softplus", x)))
 
 
 def softsign(x: Expression) -> Expression:
+    """``x / (1 + |x|)``."""
     return apply("divide", x, add(ONE, apply("abs", x)))
 
 
 def gelu(x: Expression) -> Expression:
+    """``x/2 (1 + erf(x / sqrt 2))``."""
     return apply("multiply", times(0.5, x), add(ONE, apply("erf", times(math.sqrt(0.5), x))))
 
 
@@ -88,12 +102,14 @@ def gelu_tanh(x: Expression) -> Expression:
 
 
 def thresholded_relu(x: Expression, threshold: float) -> Expression:
+    """``x`` above the threshold, else zero: a step unless it is zero."""
     if threshold == 0.0:
         return positive_part(x)
     return apply("where", apply("less", constant(threshold), x), x, ZERO)
 
 
 def shrink(x: Expression, threshold: float, bias: float) -> Expression:
+    """``x -+ bias`` beyond the threshold on either side, zero between: a step unless both are equal."""
     below = apply("where", apply("less", x, constant(-threshold)), add(x, constant(bias)), ZERO)
     return apply("where", apply("less", constant(threshold), x), apply("subtract", x, constant(bias)), below)
 
@@ -111,4 +127,5 @@ def remainder(x: Expression, y: Expression, like_c: bool) -> Expression:
 
 
 def truth_as_number(condition: Expression) -> Expression:
+    """One where the condition holds, else zero."""
     return apply("where", condition, ONE, ZERO)

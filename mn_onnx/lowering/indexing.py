@@ -39,6 +39,7 @@ def wrapped(indices: Indices, size: int) -> Indices:
 
 
 def gather(_context: Context, node: Node) -> Movable:
+    """Gather along an axis."""
     x = node.tensor(0)
     axis = normal_axis(int(node.attribute("axis", 0)), len(x.shape))
     indices = wrapped(indices_of(node), x.shape[axis])
@@ -47,6 +48,7 @@ def gather(_context: Context, node: Node) -> Movable:
 
 
 def gather_elements(_context: Context, node: Node) -> Movable:
+    """GatherElements along an axis."""
     x = node.tensor(0)
     axis = normal_axis(int(node.attribute("axis", 0)), len(x.shape))
     indices = wrapped(indices_of(node), x.shape[axis])
@@ -55,6 +57,7 @@ def gather_elements(_context: Context, node: Node) -> Movable:
 
 
 def gather_nd(_context: Context, node: Node) -> Movable:
+    """GatherND behind ``batch_dims`` shared axes."""
     x = node.tensor(0)
     indices = indices_of(node)
     batch = int(node.attribute("batch_dims", 0))
@@ -69,16 +72,18 @@ def gather_nd(_context: Context, node: Node) -> Movable:
 
 
 def scatter_elements(context: Context, node: Node) -> Movable:
+    """ScatterElements, and Scatter of old opsets."""
     x, updates = node.tensor(0), node.tensor(2)
     axis = normal_axis(int(node.attribute("axis", 0)), len(x.shape))
     indices = wrapped(indices_of(node), x.shape[axis])
     places = np.indices(indices.shape)
     places[axis] = indices
-    flat = np.ravel_multi_index(tuple(places), x.shape)
+    flat = np.asarray(np.ravel_multi_index(tuple(places), x.shape), np.int64)
     return _scatter(context, node, x, flat, updates)
 
 
 def scatter_nd(context: Context, node: Node) -> Movable:
+    """ScatterND."""
     x, updates = node.tensor(0), node.tensor(2)
     indices = indices_of(node)
     depth = indices.shape[-1]
@@ -110,6 +115,7 @@ def _scatter(context: Context, node: Node, x: Movable, flat: Indices, updates: M
 
 
 def compress(_context: Context, node: Node) -> Movable:
+    """The elements or slices where the condition holds."""
     x = node.tensor(0)
     keep = np.flatnonzero(node.constant(1, "condition"))
     axis = node.attribute("axis")
@@ -119,6 +125,7 @@ def compress(_context: Context, node: Node) -> Movable:
 
 
 def reverse_sequence(_context: Context, node: Node) -> Movable:
+    """Reverse the first elements along the time axis, as many as each batch entry says."""
     x = node.tensor(0)
     lengths = indices_of(node)
     time, batch = int(node.attribute("time_axis", 0)), int(node.attribute("batch_axis", 1))
@@ -130,6 +137,7 @@ def reverse_sequence(_context: Context, node: Node) -> Movable:
 
 
 def one_hot(_context: Context, node: Node) -> Constant:
+    """OneHot of constant indices."""
     indices, depth = indices_of(node, 0), int(np.ravel(node.constant(1, "depth"))[0])
     check_size((*indices.shape, depth))
     off, on = node.constant(2, "pair of values")

@@ -24,29 +24,18 @@ def gemm(context: Context, node: Node) -> Constant | Tensor:
         a = rearrange(a, np.transpose)
     if node.attribute("transB", 0):
         b = rearrange(b, np.transpose)
-    if isinstance(b, Constant):
-        b = Constant(alpha * b.array, b.dtype)
-    elif isinstance(a, Constant):
-        a = Constant(alpha * a.array, a.dtype)
-    if not node.has(2) or beta == 0.0:
-        return scaled(
-            context, product(context.algebra, a, b), alpha if isinstance(b, Tensor) and isinstance(a, Tensor) else 1.0
-        )
-    c = node.tensor(2)
-    columns = b.shape[1]
-    vector = (
-        isinstance(c, Constant)
-        and isinstance(b, Constant)
-        and c.array.size in (1, columns)
-        and c.shape[:-1] in ((), (1,))
-    )
-    if vector:
-        bias = np.broadcast_to(beta * np.asarray(c.array, np.float64).reshape(-1), (columns,))  # type: ignore[union-attr]
-        return product(context.algebra, a, b, bias)
-    total = scaled(
-        context, product(context.algebra, a, b), alpha if isinstance(b, Tensor) and isinstance(a, Tensor) else 1.0
-    )
-    return context.algebra.add(lift(total), scaled(context, lift(c), beta))
+    c = node.tensor(2) if node.has(2) and beta != 0.0 else None
+    if isinstance(b, Constant) and (c is None or _is_row(c, b.shape[1])):
+        weights = Constant.of(alpha * np.asarray(b.array, np.float64), b.dtype)
+        bias = None if c is None else np.broadcast_to(beta * lift(c).offset.reshape(-1), b.shape[1:])
+        return product(context.algebra, a, weights, bias)
+    total = scaled(context, product(context.algebra, a, b), alpha)
+    return total if c is None else context.algebra.add(total, scaled(context, c, beta))
+
+
+def _is_row(c: Constant | Tensor, columns: int) -> bool:
+    """Whether ``c`` is the same constant row for all rows of a matrix."""
+    return isinstance(c, Constant) and c.array.size in (1, columns) and c.shape[:-1] in ((), (1,))
 
 
 def scaled(context: Context, x: Constant | Tensor, factor: float) -> Tensor:
@@ -55,6 +44,7 @@ def scaled(context: Context, x: Constant | Tensor, factor: float) -> Tensor:
 
 
 def matmul(context: Context, node: Node) -> Constant | Tensor:
+    """MatMul."""
     return product(context.algebra, node.tensor(0), node.tensor(1))
 
 
@@ -70,20 +60,22 @@ def convolution(context: Context, node: Node) -> Tensor:
     if group < 1 or n_out % group or x.shape[1] != per_group * group:
         raise UnsupportedNode(f"input {list(x.shape)} and kernel {list(weights.shape)} do not fit group={group}")
     windows = Windows.of_node(node, x.shape[2:], tuple(kernel))
-    patches = gather_windows(lift(x), windows, 0.0)  # [n, channels, places, window]
+    patches = gather_windows(lift(x), windows, 0.0).map(lambda field: np.moveaxis(field, 1, 2))
+    n, places, _, window = patches.shape
+    biases = np.zeros(n_out) if bias is None else np.asarray(bias, np.float64)
+    size = n_out // group
     outputs = []
     for g in range(group):
-        part = patches.map(lambda field, g=g: field[:, g * per_group : (g + 1) * per_group])  # type: ignore[misc]
-        rows = part.map(lambda field: np.moveaxis(field, 1, 2))
-        n, places, channels, window = rows.shape
-        own = weights[g * n_out // group : (g + 1) * n_out // group].reshape(n_out // group, channels * window)
-        own_bias = None if bias is None else np.asarray(bias, np.float64)[g * n_out // group : (g + 1) * n_out // group]
-        result = product(context.algebra, rows.reshape(n * places, channels * window), Constant.of(own.T), own_bias)
-        outputs.append(
-            rearrange(result, lambda array, n=n, places=places: np.moveaxis(array.reshape(n, places, -1), 1, 2))
-        )  # type: ignore[misc]
-    joined = lift(concatenate(outputs, 1))
-    return joined.reshape(x.shape[0], n_out, *windows.places)
+        rows = patches.take(_channels(patches.shape, g * per_group, per_group)).reshape(n * places, per_group * window)
+        own = slice(g * size, (g + 1) * size)
+        result = product(context.algebra, rows, Constant.of(weights[own].reshape(size, -1).T), biases[own])
+        outputs.append(rearrange(result, lambda array: np.moveaxis(array.reshape(n, places, size), 1, 2)))
+    return lift(concatenate(outputs, 1)).reshape(x.shape[0], n_out, *windows.places)
+
+
+def _channels(shape: tuple[int, ...], first: int, count: int) -> np.ndarray:
+    """Flat positions of ``count`` channels, the third axis of patches."""
+    return np.arange(math.prod(shape)).reshape(shape)[:, :, first : first + count]
 
 
 def transposed_convolution(context: Context, node: Node) -> Tensor:

@@ -13,7 +13,7 @@ from mn_onnx.lowering.context import Context
 from mn_onnx.lowering.node import Node, UnsupportedNode
 from mn_onnx.lowering.table import Lowering, Table, same
 from mn_onnx.lowering.windows import Windows, gather_windows
-from mn_onnx.symbolic import Constant, Opaque, Tensor, lift
+from mn_onnx.symbolic import Constant, Opaque, Tensor, join, lift
 from mn_onnx.symbolic_linear import contract
 
 Reducer = Callable[[Context, Tensor], Tensor]
@@ -55,36 +55,44 @@ def normal_axis(axis: int, rank: int) -> int:
 
 
 def total(context: Context, rows: Tensor) -> Tensor:
+    """The sum."""
     return contract(context.algebra, rows, np.ones((rows.shape[1], 1))).reshape(-1)
 
 
 def average(context: Context, rows: Tensor) -> Tensor:
+    """The mean."""
     return contract(context.algebra, rows, np.full((rows.shape[1], 1), 1.0 / rows.shape[1])).reshape(-1)
 
 
 def total_absolute(context: Context, rows: Tensor) -> Tensor:
+    """The sum of absolute values."""
     return total(context, context.algebra.unary(rows, lambda x: apply("abs", x)))
 
 
 def total_square(context: Context, rows: Tensor) -> Tensor:
+    """The sum of squares."""
     return total(context, context.algebra.unary(rows, lambda x: apply("power", x, constant(2.0))))
 
 
 def euclidean(context: Context, rows: Tensor) -> Tensor:
+    """The root of the sum of squares; of one number, its absolute value."""
     if rows.shape[1] == 1:
         return total_absolute(context, rows)
     return context.algebra.unary(total_square(context, rows), lambda x: apply("sqrt", x))
 
 
 def log_total(context: Context, rows: Tensor) -> Tensor:
+    """The logarithm of the sum."""
     return context.algebra.unary(total(context, rows), lambda x: apply("log", x))
 
 
 def extreme(operation: str) -> Reducer:
+    """The reducer for the maximum or minimum, as a balanced tree."""
     return lambda context, rows: tree(rows, lambda x, y: context.algebra.extremum(x, y, operation))
 
 
 def total_product(context: Context, rows: Tensor) -> Tensor:
+    """The product."""
     return tree(rows, context.algebra.multiply)
 
 
@@ -99,6 +107,7 @@ def log_total_exp(context: Context, rows: Tensor) -> Tensor:
 
 
 def tree(rows: Tensor, join: Callable[[Tensor, Tensor], Tensor]) -> Tensor:
+    """Join the columns of [rows, k] pairwise."""
     return balanced([rows.map(lambda field, i=i: field[:, i]) for i in range(rows.shape[1])], join)  # type: ignore[misc]
 
 
@@ -129,6 +138,8 @@ def average_pool(context: Context, node: Node) -> Tensor:
 
 
 def global_pool(reducer: Reducer) -> Callable[[Context, Node], Tensor]:
+    """The lowering of a pool over all spatial axes."""
+
     def lower(context: Context, node: Node) -> Tensor:
         x = lift(node.tensor(0))
         spatial = x.shape[2:]
@@ -192,15 +203,14 @@ def top_k(context: Context, node: Node) -> tuple[Tensor | Opaque, ...]:
             a, b = elements[j - 1], elements[j]
             elements[j - 1] = context.algebra.extremum(a, b, low)
             elements[j] = context.algebra.extremum(a, b, high)
-    chosen = elements[:k]
-    fields = zip(*((e.point, e.base, e.function, e.scale, e.offset) for e in chosen), strict=True)
-    values = Tensor(*(np.stack(field, axis) for field in fields), dtype=x.dtype)
+    values = join(elements[:k], lambda fields: np.stack(fields, axis))
     if not node.wants(1):
         return (values,)
     return values, context.unknown("the positions of sorted elements jump from point to point")
 
 
 def cumulative_sum(context: Context, node: Node) -> Tensor:
+    """CumSum along an axis."""
     x = lift(node.tensor(0))
     axis = normal_axis(int(np.ravel(node.constant(1, "axis"))[0]), len(x.shape))
     size = x.shape[axis]

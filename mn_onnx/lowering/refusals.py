@@ -23,6 +23,10 @@ _SAMPLED = Refusal(
     "it looks up or resamples values at places that depend on the points, which multiplies coordinates",
     "extract networks of coordinates only; grids and hash tables are not piecewise linear",
 )
+_KERNELS = Refusal(
+    "it sums kernels of distances or products over support vectors, which is not piecewise linear",
+    "use a linear model or a multi-layer perceptron",
+)
 _TREES = Refusal("its result is piecewise constant", "export a regressor with a continuous output")
 _POSITIONS = Refusal(
     "its result jumps from point to point", "choose the output in front of it, the scores instead of the label"
@@ -58,14 +62,15 @@ REFUSALS: dict[tuple[str, str], Refusal] = {
     for domain, refusal, operators in (
         ("ai.onnx.ml", _TREES, "TreeEnsemble TreeEnsembleRegressor TreeEnsembleClassifier"),
         ("ai.onnx.ml", _POSITIONS, "LabelEncoder LinearClassifier SVMClassifier ZipMap"),
-        ("ai.onnx.ml", _COUPLED, "Normalizer SVMRegressor"),
+        ("ai.onnx.ml", _COUPLED, "Normalizer"),
+        ("ai.onnx.ml", _KERNELS, "SVMRegressor"),
         ("com.microsoft", _COUPLED, "SkipLayerNormalization SimplifiedLayerNormalization EmbedLayerNormalization"),
         ("com.microsoft", _ATTENTION, "Attention MultiHeadAttention GroupQueryAttention"),
         (
             "com.microsoft",
             _ROUNDED,
-            "QGemm QLinearAdd QLinearMul QLinearSigmoid QLinearLeakyRelu QAttention QuantizeLinear MatMulIntegerToFloat "
-            "DynamicQuantizeMatMul DynamicQuantizeLSTM",
+            "QGemm QLinearAdd QLinearMul QLinearSigmoid QLinearLeakyRelu QAttention QuantizeLinear "
+            "MatMulIntegerToFloat DynamicQuantizeMatMul DynamicQuantizeLSTM",
         ),
         (
             "com.microsoft",

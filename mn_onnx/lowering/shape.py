@@ -16,9 +16,11 @@ from mn_onnx.symbolic import Constant, Tensor, check_size, concatenate, lift, re
 Movable = Constant | Tensor
 
 INT64 = np.dtype(np.int64)
+_NUMBERS = {"value_float": np.float32, "value_floats": np.float32, "value_int": np.int64, "value_ints": np.int64}
 
 
 def identity(_context: Context, node: Node) -> Movable:
+    """Identity."""
     return node.tensor(0)
 
 
@@ -35,6 +37,7 @@ def dropout(_context: Context, node: Node) -> tuple[Movable, ...]:
 
 
 def reshape(_context: Context, node: Node) -> Movable:
+    """Reshape to a shape with at most one -1, where zero copies an axis unless ``allowzero`` is set."""
     x = node.tensor(0)
     target = node.integers(1, "shape", "shape") or []
     if not node.attribute("allowzero", 0):
@@ -54,6 +57,7 @@ def reshape(_context: Context, node: Node) -> Movable:
 
 
 def flatten(_context: Context, node: Node) -> Movable:
+    """Flatten to a matrix."""
     x = node.tensor(0)
     axis = int(node.attribute("axis", 1))
     axis = axis + len(x.shape) if axis < 0 else axis
@@ -61,6 +65,7 @@ def flatten(_context: Context, node: Node) -> Movable:
 
 
 def squeeze(_context: Context, node: Node) -> Movable:
+    """Squeeze the given axes, or all of size one."""
     x = node.tensor(0)
     axes = node.integers(1, "axes", "list of axes")
     if axes is None:
@@ -70,6 +75,7 @@ def squeeze(_context: Context, node: Node) -> Movable:
 
 
 def unsqueeze(_context: Context, node: Node) -> Movable:
+    """Insert axes of size one."""
     x = node.tensor(0)
     axes = node.integers(1, "axes", "list of axes") or []
     rank = len(x.shape) + len(axes)
@@ -78,11 +84,13 @@ def unsqueeze(_context: Context, node: Node) -> Movable:
 
 
 def transpose(_context: Context, node: Node) -> Movable:
+    """Transpose, reversing the axes by default."""
     perm = node.attribute("perm")
     return rearrange(node.tensor(0), lambda array: np.transpose(array, perm))
 
 
 def expand(_context: Context, node: Node) -> Movable:
+    """Broadcast to a shape."""
     x = node.tensor(0)
     shape = np.broadcast_shapes(x.shape, tuple(int(n) for n in np.ravel(node.constant(1, "shape"))))
     check_size(shape)
@@ -90,6 +98,7 @@ def expand(_context: Context, node: Node) -> Movable:
 
 
 def tile(_context: Context, node: Node) -> Movable:
+    """Repeat along every axis."""
     x = node.tensor(0)
     repeats = [int(n) for n in np.ravel(node.constant(1, "count of repeats"))]
     if len(repeats) != len(x.shape):
@@ -99,6 +108,7 @@ def tile(_context: Context, node: Node) -> Movable:
 
 
 def concat(_context: Context, node: Node) -> Movable:
+    """Concat along an axis."""
     parts = [node.tensor(index) for index in range(len(node.inputs))]
     axis = int(node.attribute("axis", 1))
     return concatenate(parts, normal_axis(axis, len(parts[0].shape)))
@@ -153,18 +163,20 @@ def split(_context: Context, node: Node) -> tuple[Movable, ...]:
 
 
 def shape(_context: Context, node: Node) -> Constant:
+    """The sizes of the axes from ``start`` to ``end``."""
     sizes = np.array(node.tensor(0).shape, np.int64)
     start, end = int(node.attribute("start", 0)), node.attribute("end")
     return Constant(sizes[start : None if end is None else int(end)], INT64)
 
 
 def size(_context: Context, node: Node) -> Constant:
+    """The number of elements."""
     return Constant(np.asarray(math.prod(node.tensor(0).shape), np.int64), INT64)
 
 
 def constant(_context: Context, node: Node) -> Constant:
     """A constant given by one of several attributes."""
-    for name, dtype in (("value_float", np.float32), ("value_floats", np.float32), ("value_int", np.int64), ("value_ints", np.int64)):  # fmt: skip
+    for name, dtype in _NUMBERS.items():
         if node.attribute(name) is not None:
             return Constant.of(np.asarray(node.attribute(name), dtype))
     value = node.attribute("value")
@@ -174,6 +186,7 @@ def constant(_context: Context, node: Node) -> Constant:
 
 
 def constant_of_shape(_context: Context, node: Node) -> Constant:
+    """A tensor of one repeated number."""
     sizes = tuple(int(n) for n in np.ravel(node.constant(0, "shape")))
     check_size(sizes)
     value = node.attribute("value") or Constant.of(np.zeros(1, np.float32))
@@ -181,6 +194,7 @@ def constant_of_shape(_context: Context, node: Node) -> Constant:
 
 
 def arange(_context: Context, node: Node) -> Constant:
+    """Range."""
     start, limit, delta = (np.ravel(node.constant(i, "range"))[0] for i in range(3))
     check_size((max(math.ceil((limit - start) / delta), 0),))
     return Constant.of(np.arange(start, limit, delta), node.tensor(0).dtype)
@@ -237,10 +251,11 @@ def _pad(node: Node, axes: Sequence[int], pads: Sequence[int], value: float) -> 
         return Constant(np.pad(x.array[crop], grow, constant_values=value), x.dtype)
     if mode not in ("reflect", "edge", "wrap"):
         raise UnsupportedNode(f"mode {mode!r} is not defined; constant, reflect, edge and wrap are")
-    return rearrange(x, lambda array: np.pad(array[crop], grow, mode=mode))  # type: ignore[call-overload]
+    return rearrange(x, lambda array: np.pad(array[crop], grow, mode=mode))
 
 
 def depth_to_space(_context: Context, node: Node) -> Movable:
+    """Move channels into blocks of space."""
     x = node.tensor(0)
     n, c, h, w = x.shape
     block = int(node.attribute("blocksize"))
@@ -253,6 +268,7 @@ def depth_to_space(_context: Context, node: Node) -> Movable:
 
 
 def space_to_depth(_context: Context, node: Node) -> Movable:
+    """Move blocks of space into channels."""
     x = node.tensor(0)
     n, c, h, w = x.shape
     block = int(node.attribute("blocksize"))

@@ -20,8 +20,9 @@ Lower = Callable[["Context", Node], Any]
 class Lowering:
     """How an operator is lowered from version ``since`` of its domain on.
 
-    ``fidelity``: whether the result is piecewise linear wherever its inputs are, or needs a surrogate. ``on_constants``:
-    the lowering itself handles inputs that are all constant; otherwise onnx's reference evaluator folds those.
+    ``fidelity``: whether the result is piecewise linear wherever its inputs are, or needs a surrogate.
+    ``on_constants``: the lowering itself handles inputs that are all constant; otherwise onnx's reference evaluator
+    folds those.
     """
 
     since: int
@@ -32,7 +33,7 @@ class Lowering:
 
 @dataclass(frozen=True)
 class Refusal:
-    """Why an operator on data that depend on the points is refused, and what to do. ``never_fold``: even on constants."""
+    """Why an operator on data that depend on the points (if ``never_fold``, on any) is refused, and what to do."""
 
     reason: str
     remedy: str

@@ -18,8 +18,8 @@ class Windows:
     """The windows over the spatial axes.
 
     ``places``: how many windows there are along each axis. ``index``: int64 [places, window], flat positions in the
-    spatial axes, -1 in the padding. ``in_padded``: bool of the same shape, true where a position lies in the input or in
-    its explicit padding (a window can reach beyond it in ceil mode).
+    spatial axes, -1 in the padding. ``in_padded``: bool of the same shape, true where a position lies in the input or
+    in its explicit padding (a window can reach beyond it in ceil mode).
     """
 
     places: tuple[int, ...]
