@@ -33,6 +33,28 @@ def preceding_corners(offsets: NDArray[np.int64]) -> Indices:
 
 
 @numba.njit(cache=True, nogil=True)
+def _link_corners(
+    offsets: NDArray[np.int64],
+    corners: Indices,
+    block_size: int,
+    first: int,
+    last: int,
+    heads: Indices,
+    preceding: Indices,
+    twins: Indices,
+) -> None:
+    """`half_edge_heads` and `preceding_corners` of the polygons in blocks ``first .. last``; twins are -1 so far."""
+    for polygon in range(first * block_size, min(last * block_size, offsets.size - 1)):
+        begin, end = offsets[polygon], offsets[polygon + 1]
+        previous = end - 1
+        for corner in range(begin, end):
+            preceding[corner] = previous
+            heads[previous] = corners[corner]
+            twins[corner] = -1
+            previous = corner
+
+
+@numba.njit(cache=True, nogil=True)
 def _sort_partitions(
     corners: Indices,
     order: Indices,
@@ -70,7 +92,15 @@ def corners_by_vertex(corners: Indices, n_vertices: int, threads: int) -> tuple[
     wanted = max(1, min(_MAX_PARTITIONS, corners.size // _CORNERS_PER_PARTITION))
     shift = (-(-n_vertices // wanted) - 1).bit_length()
     n_partitions = -(-n_vertices >> shift)
-    order, partition_starts = group_items((corners >> shift).astype(np.uint16), n_partitions, threads)
+    partitions = np.empty(corners.size, np.uint16)
+
+    def assign_partitions(first: int, last: int) -> None:
+        for block in range(first, last):
+            inside = slice(block * BLOCK_SIZE, (block + 1) * BLOCK_SIZE)
+            partitions[inside] = corners[inside] >> shift
+
+    run_blocks(assign_partitions, block_count(corners.size), threads)
+    order, partition_starts = group_items(partitions, n_partitions, threads)
     starts = np.empty(n_vertices + 1, np.int64)
     starts[n_vertices] = corners.size
     run_blocks(
@@ -135,12 +165,16 @@ def pair_half_edges(offsets: NDArray[np.int64], corners: Indices, n_vertices: in
     Two half-edges are twins if they join the same two vertices in opposite directions, belong to different polygons
     and no third half-edge joins these vertices. Returns the twins as corner numbers, [c].
     """
-    twins = np.full(corners.size, -1, index_dtype(corners.size))
+    twins: Indices = np.empty(corners.size, index_dtype(corners.size))
     if not corners.size:
         return twins
     order, starts = corners_by_vertex(corners, n_vertices, threads)
-    heads = half_edge_heads(offsets, corners)
-    preceding = preceding_corners(offsets)
+    heads, preceding = np.empty_like(corners), np.empty_like(twins)
+    run_blocks(
+        lambda first, last: _link_corners(offsets, corners, BLOCK_SIZE, first, last, heads, preceding, twins),
+        block_count(offsets.size - 1),
+        threads,
+    )
     widest = int(np.diff(offsets).max())
     run_blocks(
         lambda first, last: _match_at_vertices(

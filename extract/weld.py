@@ -188,7 +188,7 @@ def _weld_corners(soup: PolygonSoup, threads: int) -> tuple[Floats, Indices, int
         n_blocks,
         threads,
     )
-    tolerance = POSITION_AGREEMENT * float(np.abs(vertices).max(initial=0.0))
+    tolerance = POSITION_AGREEMENT * max(float(vertices.max(initial=0.0)), -float(vertices.min(initial=0.0)))
     disagreements = np.zeros(n_blocks, np.int64)
     gaps = np.zeros(n_blocks)
     run_blocks(
