@@ -22,13 +22,13 @@ BOX_ROUNDING = 1e-9
 class Invariants:
     """Counts and measures of a `Surface`.
 
-    ``edges`` are undirected. ``boundary_edges`` have one polygon and lie on the box; ``unmatched_edges`` are
-    half-edges inside the box without a partner, among them the half-edges of ``misoriented_edges`` (two polygons that
-    run along the edge in the same direction) and ``nonmanifold_edges`` (three or more polygons). ``off_box_edges``
-    are boundary edges that do not lie where they claim; 0 where the box was not given. ``euler`` is vertices in use -
-    edges + polygons. ``valences``: how many vertices inside the box have how many edges. ``degenerate_polygons`` have
-    no area, ``zero_length_edges`` counts polygons with such an edge, ``flipped_polygons`` face against their gradient
-    by more than rounding. ``volume`` is None where the surface is not closed.
+    ``edges`` are undirected. ``boundary_edges`` have one polygon and lie on the box; ``unmatched_edges`` are half-edges
+    inside the box without a partner, among them the half-edges of ``misoriented_edges`` (two polygons that run along the
+    edge in the same direction) and ``nonmanifold_edges`` (three or more polygons). ``off_box_edges`` are boundary edges
+    that do not lie where they claim; 0 where the box was not given. ``euler`` is vertices in use - edges + polygons.
+    ``valences``: how many vertices inside the box have how many edges. ``degenerate_polygons`` have no area,
+    ``polygons_with_zero_edges`` an edge without length; ``flipped_polygons`` face against their gradient by more than
+    rounding. ``volume`` is None where the surface is not closed.
     """
 
     polygons: int
@@ -43,7 +43,7 @@ class Invariants:
     nonmanifold_edges: int
     nonmanifold_vertices: int
     degenerate_polygons: int
-    zero_length_edges: int
+    polygons_with_zero_edges: int
     flipped_polygons: int
     position_disagreements: int
     shortest_edge: float | None
@@ -96,7 +96,7 @@ class Invariants:
             text
             for count, text in (
                 (self.degenerate_polygons, f"{self.degenerate_polygons} polygons have no area"),
-                (self.zero_length_edges, f"{self.zero_length_edges} polygons have an edge of length zero"),
+                (self.polygons_with_zero_edges, f"{self.zero_length_edges} polygons have an edge of length zero"),
                 (self.boundary_edges, f"the surface leaves the box along {self.boundary_edges} edges"),
             )
             if count
@@ -182,7 +182,7 @@ def check_invariants(surface: Surface, *, bounds: ArrayLike | None = None) -> In
         nonmanifold_edges=int((uses > 2).sum()),
         nonmanifold_vertices=int((~umbrellas.manifold).sum()),
         degenerate_polygons=int((areas == 0).sum()),
-        zero_length_edges=int((measures.shortest_edges == 0).sum()),
+        polygons_with_zero_edges=int((measures.shortest_edges == 0).sum()),
         flipped_polygons=int((facing < -rounding * measures.perimeters).sum()),
         position_disagreements=int(surface.report.get("position_disagreements", 0)),
         shortest_edge=float(measures.shortest_edges.min()) if surface.n_polygons else None,

@@ -109,7 +109,7 @@ def test_degenerate_polygons_are_noted():
     vertices = [[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [0, 1, 0]]
     found = check_invariants(from_lists(vertices, [[0, 1, 2, 3, 4], [0, 4, 3]]))
     assert found.degenerate_polygons == 1
-    assert found.zero_length_edges == 2
+    assert found.polygons_with_zero_edges == 2
     assert found.shortest_edge == 0.0
     assert len(found.notes()) == 2
 
