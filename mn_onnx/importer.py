@@ -223,7 +223,7 @@ def _choose_channel(
     chosen = channel or 0
     if not -width <= chosen < width:
         raise UsageError(f"output {name!r} has {width} channels; there is no channel {channel}")
-    return rows.map(lambda field: field[:, chosen]), Output(name, axis, chosen % width)
+    return rows[:, chosen], Output(name, axis, chosen % width)
 
 
 def _point_axis(tensor: Tensor, n: int) -> int | None:
@@ -266,7 +266,7 @@ def _batch_problem(first: Context, second: Context) -> Problem:
 def _network(run: _Run, dim: int) -> Network:
     """Units that the chosen output needs, in topological order, with variables renumbered."""
     store = run.context.store
-    rows = store.rows(run.field.map(lambda f: f[:1]), run.output.name)
+    rows = store.rows(run.field[:1], run.output.name)
     needed = set()
     pending = [int(v) for v in rows.columns]
     while pending:

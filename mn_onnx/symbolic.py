@@ -103,6 +103,10 @@ class Tensor:
         """Apply the same rearrangement to all fields."""
         return join([self], lambda fields: change(fields[0]))
 
+    def __getitem__(self, index: Any) -> Tensor:
+        """The elements at a numpy index."""
+        return self.map(lambda field: field[index])
+
     def take(self, index: NDArray[np.int64]) -> Tensor:
         """The elements at flat positions ``index``, in its shape."""
         check_size(index.shape)
@@ -174,9 +178,16 @@ def concatenate(values: Sequence[Constant | Tensor], axis: int) -> Constant | Te
     """Join along an axis; constants stay constants if all are."""
     dtype = values[0].dtype
     check_size((sum(math.prod(value.shape) for value in values),))
-    if all(isinstance(value, Constant) for value in values):
-        return Constant(np.concatenate([value.array for value in values], axis), dtype)  # type: ignore[union-attr]
+    constants = [value.array for value in values if isinstance(value, Constant)]
+    if len(constants) == len(values):
+        return Constant(np.concatenate(constants, axis), dtype)
     return join([lift(value) for value in values], lambda fields: np.concatenate(fields, axis))
+
+
+def part(value: Constant | Tensor, axis: int, start: int, size: int) -> Constant | Tensor:
+    """``size`` slices along an axis, from ``start`` on."""
+    index = (*(slice(None) for _ in range(axis)), slice(start, start + size))
+    return rearrange(value, lambda array: array[index])
 
 
 def groups(*keys: Array) -> tuple[NDArray[np.int64], NDArray[np.int64]]:

@@ -11,7 +11,7 @@ import numpy as np
 from mn_onnx.ir.expression import apply, constant
 from mn_onnx.symbolic import CONSTANT, IDENTITY, Tensor, check_size, join
 from mn_onnx.symbolic_compose import Builder, Composer
-from mn_onnx.symbolic_elements import Mask, assign, copy, drop_zero_scales, select
+from mn_onnx.symbolic_elements import Mask, assign, copy, drop_zero_scales
 from mn_onnx.symbolic_store import Rows
 
 BOOL = np.dtype(bool)
@@ -43,10 +43,10 @@ class Algebra(Composer):
         result.offset[same] = x.offset[same] + sign * y.offset[same]
         related = both & ~same & self._related(x, y)
         if related.any():
-            assign(result, related, self._add_related(select(x, related), select(y, related), sign), packed=True)
+            assign(result, related, self._add_related(x[related], y[related], sign), packed=True)
         apart = both & ~same & ~related
         if apart.any():
-            assign(result, apart, self._add_rows(select(x, apart), select(y, apart), sign), packed=True)
+            assign(result, apart, self._add_rows(x[apart], y[apart], sign), packed=True)
         return drop_zero_scales(result)
 
     def _add_related(self, x: Tensor, y: Tensor, sign: float) -> Tensor:
@@ -66,7 +66,7 @@ class Algebra(Composer):
             result.base[i] = self.store.refuse_together(np.array([x.base[i], y.base[i]]))
         good = ~refused
         n = int(good.sum())
-        stacked = join([select(x, good), select(y, good)], np.concatenate)
+        stacked = join([x[good], y[good]], np.concatenate)
         rows = self.store.rows(stacked, self.node)
         total = Rows(
             rows.columns, rows.matrix[:n] + sign * rows.matrix[n:], rows.constants[:n] + sign * rows.constants[n:]
@@ -131,7 +131,7 @@ class Algebra(Composer):
     def _compose_or_refuse(self, result: Tensor, x: Tensor, y: Tensor, mask: Mask, build: Builder, what: str) -> None:
         related = mask & (~x.live | self._related(x, y))
         if related.any():
-            assign(result, related, self._compose([select(x, related), select(y, related)], build), packed=True)
+            assign(result, related, self._compose([x[related], y[related]], build), packed=True)
         apart = mask & ~related
         if apart.any():
             problem = self.report(
@@ -147,10 +147,10 @@ class Algebra(Composer):
         def choose(a: Tensor, b: Tensor) -> Tensor:
             related = ~(a.live & b.live) | self._related(a, b)
             result = copy(a)
-            direct = self._compose([select(a, related), select(b, related)], lambda p, q: apply(operation, p, q))
+            direct = self._compose([a[related], b[related]], lambda p, q: apply(operation, p, q))
             assign(result, related, direct, packed=True)
             if not related.all():
-                difference = self._add_rows(select(a, ~related), select(b, ~related), -1.0)
+                difference = self._add_rows(a[~related], b[~related], -1.0)
                 outcome = self._elementwise(
                     [difference],
                     lambda d: self._compose([d], lambda p: apply(operation, p, constant(0.0))),
@@ -172,10 +172,10 @@ class Algebra(Composer):
         def choose(a: Tensor, b: Tensor) -> Tensor:
             related = ~(a.live & b.live) | self._related(a, b)
             result = copy(a)
-            direct = self._compose([select(a, related), select(b, related)], lambda p, q: apply(operation, p, q))
+            direct = self._compose([a[related], b[related]], lambda p, q: apply(operation, p, q))
             assign(result, related, direct, packed=True)
             if not related.all():
-                left, right = select(a, ~related), select(b, ~related)
+                left, right = a[~related], b[~related]
                 excess = self._elementwise(
                     [self._add_rows(left, right, -1.0)],
                     lambda d: self._compose([d], lambda p: apply(operation, p, constant(0.0))),
@@ -196,12 +196,12 @@ class Algebra(Composer):
         assign(result, known & (c.offset != 0.0), a)
         open_ = ~known
         if open_.any():
-            c, a, b = select(c, open_), select(a, open_), select(b, open_)
+            c, a, b = c[open_], a[open_], b[open_]
             related = (~a.live | self._related(c, a)) & (~b.live | self._related(c, b)) & c.live
             chosen = copy(b)
-            assign(chosen, related, self._choose(*(select(p, related) for p in (c, a, b))), packed=True)
+            assign(chosen, related, self._choose(*(p[related] for p in (c, a, b))), packed=True)
             if not related.all():
-                c, a, b = (select(p, ~related) for p in (c, a, b))
+                c, a, b = (p[~related] for p in (c, a, b))
                 difference = self.add(a, b, -1.0)
                 gain = self.apply([c, difference], lambda t, d: apply("where", t, d, constant(0.0)), x.dtype)
                 assign(chosen, ~related, self.add(b, gain), packed=True)

@@ -10,7 +10,7 @@ from mn_onnx.ir.expression import Expression, T, constant
 from mn_onnx.ir.network import KnotTable
 from mn_onnx.ir.scalar import UndefinedFunction, discontinuities, evaluate, simplify
 from mn_onnx.symbolic import CONSTANT, IDENTITY, NO_POINT, Array, Tensor, check_size, groups
-from mn_onnx.symbolic_elements import Mask, affine, assign, copy, empty, select, substitute
+from mn_onnx.symbolic_elements import Mask, affine, assign, copy, empty, substitute
 from mn_onnx.symbolic_store import Store
 
 Builder = Callable[..., Expression]
@@ -127,7 +127,7 @@ class Composer:
     def _related(self, x: Tensor, y: Tensor) -> Mask:
         """Where both are live and functions of the same direction."""
         both = x.live & y.live
-        related = both & (x.base == y.base)
+        related: Mask = both & (x.base == y.base)
         rest = np.flatnonzero(both & ~related)
         if rest.size:
             bases = self.store.bases
@@ -167,7 +167,7 @@ class Composer:
         for operand in operands:
             keys += [operand.base, operand.function, operand.scale, operand.offset]
         first, member = groups(*keys)
-        unique = [select(operand, first) for operand in operands]
+        unique = [operand[first] for operand in operands]
         refused = mixed[first].copy()
         for operand in unique:
             refused |= operand.refused
@@ -176,7 +176,7 @@ class Composer:
         result = empty(first.size, operands[0].dtype)
         good = ~refused
         if good.any():
-            assign(result, good, compute(*(select(operand, good) for operand in unique)), packed=True)
+            assign(result, good, compute(*(operand[good] for operand in unique)), packed=True)
         for i in np.flatnonzero(refused).tolist():
             bases = np.array([operand.base[i] for operand in unique])
             result.base[i] = self._refuse_combination(bases, bool(mixed[first][i]))

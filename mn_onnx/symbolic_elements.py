@@ -40,11 +40,6 @@ def copy(x: Tensor) -> Tensor:
     return x.map(lambda field: field.copy())
 
 
-def select(x: Tensor, which: np.ndarray) -> Tensor:
-    """The elements at a mask or at positions."""
-    return x.map(lambda field: field[which])
-
-
 def assign(target: Tensor, mask: Mask, source: Tensor, *, packed: bool = False) -> None:
     """Overwrite elements of ``target`` at ``mask`` by those of ``source``, which holds only these if ``packed``."""
     for name in ("point", "base", "function", "scale", "offset"):

@@ -32,7 +32,7 @@ def contract(algebra: Algebra, x: Tensor, weights: Floats, bias: Floats | None =
         lowest, lone = np.full(r, NO_POINT), np.ones(r, np.bool_)
     for members in _alike(x, lone):
         first = members[0]
-        row = x.map(lambda field, first=first: field[first])  # type: ignore[misc]
+        row = x[first]
         base[members], function[members], scale[members], offset[members] = _contract_row(algebra, row, weights, bias)
         if lone[first]:
             point[members] = lowest[members, None]
@@ -64,7 +64,7 @@ def _contract_row(
     algebra: Algebra, row: Tensor, weights: Floats, bias: Floats | None
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], Floats, Floats]:
     refused = row.refused
-    good = row.map(lambda field: field[~refused])
+    good = row[~refused]
     rows = algebra.store.rows(good, algebra.node)
     transposed = weights[~refused].T
     constants = transposed @ rows.constants
@@ -120,7 +120,7 @@ def _product_with_constant(
         return contract(algebra, rows, weights.reshape(k, n), bias).reshape(*batch, m, n)
     left = x.broadcast((*batch, m, k)).reshape(-1, m, k)
     right = np.broadcast_to(weights, (*batch, k, n)).reshape(-1, k, n)
-    parts = [contract(algebra, left.map(lambda f, i=i: f[i]), right[i], bias) for i in range(len(right))]  # type: ignore[misc]
+    parts = [contract(algebra, left[i], right[i], bias) for i in range(len(right))]
     return join(parts, np.stack).reshape(*batch, m, n)
 
 

@@ -57,7 +57,7 @@ def divide(context: Context, node: Node) -> Tensor:
 def mean(context: Context, node: Node) -> Tensor:
     """Mean of any number of tensors."""
     total = n_ary(Algebra.add)(context, node)
-    return context.algebra.divide(total, lift(Constant.of(np.float64(len(node.inputs)))))  # type: ignore[arg-type]
+    return context.algebra.divide(total, lift(Constant.of(np.asarray(float(len(node.inputs))))))
 
 
 def negate(context: Context, node: Node) -> Tensor:

@@ -11,7 +11,7 @@ from mn_onnx.lowering.context import Context, GraphValue
 from mn_onnx.lowering.node import Node, OpaqueInput, UnsupportedNode
 from mn_onnx.lowering.reduction import normal_axis
 from mn_onnx.lowering.table import Table, same
-from mn_onnx.symbolic import Constant, Opaque, Tensor, concatenate, rearrange
+from mn_onnx.symbolic import Constant, Opaque, Tensor, concatenate, part, rearrange
 
 INT64 = np.dtype(np.int64)
 
@@ -64,7 +64,7 @@ def scan(context: Context, node: Node) -> tuple[GraphValue, ...]:
     collected: list[list[GraphValue]] = [[] for _ in range(n_collected)]
     for i in range(length):
         steps = [
-            rearrange(x, lambda a, axis=axis, at=length - 1 - i if back else i: np.take(a, at, axis))  # type: ignore[misc]
+            _slice_at(x, axis, length - 1 - i if back else i)
             for x, axis, back in zip(sequences, axes, in_backward, strict=True)
         ]
         names = [value.name for value in body.input]
@@ -77,6 +77,10 @@ def scan(context: Context, node: Node) -> tuple[GraphValue, ...]:
         for values, axis, back in zip(collected, out_axes, out_backward, strict=True)
     ]
     return (*state, *joined)
+
+
+def _slice_at(x: Constant | Tensor, axis: int, position: int) -> Constant | Tensor:
+    return rearrange(x, lambda array: np.take(array, position, axis))
 
 
 def _given(value: Any) -> GraphValue:
@@ -155,10 +159,10 @@ def split_to_sequence(_context: Context, node: Node) -> tuple[list[GraphValue]]:
             sizes.append(x.shape[axis] - sum(sizes))
     parts: list[GraphValue] = []
     for end, size in zip(np.cumsum(sizes).tolist(), sizes, strict=True):
-        part = rearrange(x, lambda a, end=end, size=size: np.take(a, np.arange(end - size, end), axis))  # type: ignore[misc]
+        piece = part(x, axis, end - size, size)
         if single and not node.attribute("keepdims", 1):
-            part = rearrange(part, lambda a: np.squeeze(a, axis))
-        parts.append(part)
+            piece = rearrange(piece, lambda array: np.squeeze(array, axis))
+        parts.append(piece)
     return (parts,)
 
 

@@ -108,7 +108,7 @@ def log_total_exp(context: Context, rows: Tensor) -> Tensor:
 
 def tree(rows: Tensor, join: Callable[[Tensor, Tensor], Tensor]) -> Tensor:
     """Join the columns of [rows, k] pairwise."""
-    return balanced([rows.map(lambda field, i=i: field[:, i]) for i in range(rows.shape[1])], join)  # type: ignore[misc]
+    return balanced([rows[:, i] for i in range(rows.shape[1])], join)
 
 
 def pool(reducer: Reducer, padding: float) -> Callable[[Context, Node], Tensor]:
@@ -169,7 +169,7 @@ def softmax(log: bool, flatten: bool) -> Callable[[Context, Node], Tensor]:
                 "export the logits in front of it, and choose a channel",
             )
         if width == 2:
-            difference = context.algebra.add(rows, rows.map(lambda field: field[..., ::-1]), -1.0)
+            difference = context.algebra.add(rows, rows[..., ::-1], -1.0)
             if log:
                 result = context.algebra.unary(
                     difference, lambda d: apply("negate", apply("softplus", apply("negate", d)))

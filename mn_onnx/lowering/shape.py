@@ -11,7 +11,7 @@ from mn_onnx.lowering.context import Context
 from mn_onnx.lowering.node import Node, UnsupportedNode
 from mn_onnx.lowering.reduction import normal_axis
 from mn_onnx.lowering.table import Lowering, Table, same
-from mn_onnx.symbolic import Constant, Tensor, check_size, concatenate, lift, rearrange
+from mn_onnx.symbolic import Constant, Tensor, check_size, concatenate, lift, part, rearrange
 
 Movable = Constant | Tensor
 
@@ -156,10 +156,7 @@ def split(_context: Context, node: Node) -> tuple[Movable, ...]:
             f"parts of sizes {sizes} do not fit an axis of {x.shape[axis]} in {node.n_outputs} outputs"
         )
     ends = np.cumsum(sizes)
-    return tuple(
-        rearrange(x, lambda a, end=end, size=size: np.take(a, np.arange(end - size, end), axis))  # type: ignore[misc]
-        for end, size in zip(ends.tolist(), sizes, strict=True)
-    )
+    return tuple(part(x, axis, end - size, size) for end, size in zip(ends.tolist(), sizes, strict=True))
 
 
 def shape(_context: Context, node: Node) -> Constant:
