@@ -24,9 +24,9 @@ class Invariants:
 
     ``edges`` are undirected. ``boundary_edges`` have one polygon and lie on the box; ``unmatched_edges`` are half-edges
     inside the box without a partner, among them the half-edges of ``misoriented_edges`` (two polygons that run along
-    the edge in the same direction) and ``nonmanifold_edges`` (three or more polygons). ``off_box_edges`` are boundary edges
-    that do not lie where they claim; 0 where the box was not given. ``euler`` is vertices in use - edges + polygons.
-    ``valences``: how many vertices inside the box have how many edges. ``degenerate_polygons`` have no area,
+    the edge in the same direction) and ``nonmanifold_edges`` (three or more polygons). ``off_box_edges`` are boundary
+    edges that do not lie where they claim; 0 where the box was not given. ``euler`` is vertices in use - edges +
+    polygons. ``valences``: how many vertices inside the box have how many edges. ``degenerate_polygons`` have no area,
     ``polygons_with_zero_edges`` an edge without length; ``flipped_polygons`` face against their gradient by more than
     rounding. ``volume`` is None where the surface is not closed.
     """
