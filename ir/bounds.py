@@ -66,9 +66,7 @@ class BoundPropagation:
                 continue
             constant = constant + of_outputs @ self._centre[block.outputs]
             radius = radius + np.abs(of_outputs) @ self._radius[block.outputs]
-            of_units = of_outputs * self._slope[block.outputs]
-            if block.outputs.size != block.units.size:
-                of_units = np.add.reduceat(of_units, np.searchsorted(block.owner, np.arange(block.units.size)), axis=1)
+            of_units = block.sum_outputs(of_outputs * self._slope[block.outputs])
             constant += of_units @ block.bias
             magnitude = np.abs(of_units)
             reach = np.maximum(np.abs(self.lower[block.columns]), np.abs(self.upper[block.columns]))
@@ -128,5 +126,5 @@ def unit_bounds(network: Network, lower: Floats, upper: Floats) -> tuple[Floats,
 
 
 def output_bounds(network: Network, lower: Floats, upper: Floats) -> tuple[float, float]:
-    """Bounds of ``f`` over the box ``lower``..``upper`` (float64 [input_dim]). Raises ``ValueError`` as `unit_bounds`."""
+    """Bounds of ``f`` over the box ``lower``..``upper`` (float64 [input_dim]); raises as `unit_bounds`."""
     return _propagate(network, lower, upper)[0].output()

@@ -26,6 +26,14 @@ class LevelBlock:
     outputs: Integers
     owner: Integers
 
+    def sum_outputs(self, of_outputs: Floats) -> Floats:
+        """Sums over the outputs of each unit: [n, o] to [n, u]."""
+        if self.outputs.size == self.units.size:
+            return of_outputs
+        starts = np.searchsorted(self.owner, np.arange(self.units.size))
+        totals: Floats = np.add.reduceat(of_outputs, starts, axis=1)
+        return totals
+
 
 def dense_rows(rows: Sequence[AffineRow], columns: Integers) -> Floats:
     """The weights of ``rows`` over ``columns`` (a sorted superset of theirs), float64 [rows, columns]."""

@@ -49,8 +49,8 @@ class Canonical:
     """The canonical form of a level set ``{x in box | source(x) = level}``.
 
     ``network``: canonical; its level set 0 is that set, and it increases where ``source`` does. ``source``: the
-    imported network. ``level``: the level asked for. ``lower``, ``upper``: the box, float64 [input_dim]; surrogates and their
-    errors hold inside. ``sign``: -1 if ``network`` is the negated pre-activation of a decreasing head, else 1.
+    imported network. ``level``: the level asked for. ``lower``, ``upper``: the box, float64 [input_dim]; surrogates and
+    their errors hold inside. ``sign``: -1 if ``network`` is the negated pre-activation of a decreasing head, else 1.
     ``empty_reason``: why the level set is known to be empty, else "". ``steps``: the passes that ran.
     """
 

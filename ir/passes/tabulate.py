@@ -1,8 +1,8 @@
 """Every unit gets its table: exact for piecewise-linear functions, a surrogate with proved errors for smooth ones.
 
 Levels are done from the inputs up, because the range of a unit depends on the tables below it. Ranges enclose the
-values that the pre-activation takes in the network of tables and in the one of true functions. Units of a level with the same
-functions share one surrogate over the hull of their ranges.
+values that the pre-activation takes in the network of tables and in the one of true functions. Units of a level with
+the same functions share one surrogate over the hull of their ranges.
 """
 
 from __future__ import annotations

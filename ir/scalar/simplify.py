@@ -42,12 +42,12 @@ def _table(function: Piecewise) -> KnotTable | None:
     knots: list[float] = []
     pieces = [function.pieces[0]]
     for exact_knot, piece in zip(function.knots, function.pieces[1:], strict=True):
-        knot = float(exact_knot)
-        if knots and knot == knots[-1]:
+        rounded = float(exact_knot)
+        if knots and rounded == knots[-1]:
             # Two knots in one double: the piece between them is narrower than the rounding of t.
             pieces[-1] = piece
         else:
-            knots.append(knot)
+            knots.append(rounded)
             pieces.append(piece)
     coefficients = np.array([[float(c) for c in (*piece, Fraction(0), Fraction(0))[:2]] for piece in pieces])
     return KnotTable.exact(knots, [coefficients[:, 1].tolist()], [coefficients[:, 0].tolist()])

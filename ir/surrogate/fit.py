@@ -41,8 +41,8 @@ def fit(functions: Sequence[ScalarFunction], lower: float, upper: float, toleran
 
     Knots are shared: they follow, at every place, the function that bends most beside its tolerance, and include all
     knots of functions that are tables themselves. Outside the range the outer pieces continue; errors are proved for
-    the range. Raises `UndefinedFunction` if a function jumps, is unbounded or undefined on the range, or cannot be followed
-    within its tolerance.
+    the range. Raises `UndefinedFunction` if a function jumps, is unbounded or undefined on the range, or cannot be
+    followed within its tolerance.
     """
     smooth = [(index, f) for index, f in enumerate(functions) if isinstance(f, Expression)]
     fixed = [f.knots[(f.knots > lower) & (f.knots < upper)] for f in functions if isinstance(f, KnotTable)]
@@ -120,7 +120,8 @@ def _sag(expression: Expression, nodes: Floats, slopes: Floats, intercepts: Floa
     """The middle of the deviation's range on each interval, from samples; balances the lines, proves nothing."""
     inside = nodes[:-1, None] + np.diff(nodes)[:, None] * np.linspace(0.0, 1.0, 17)
     deviations = evaluate(expression, inside) - (slopes[:, None] * inside + intercepts[:, None])
-    return 0.5 * (deviations.max(axis=1) + deviations.min(axis=1))
+    middle: Floats = 0.5 * (deviations.max(axis=1) + deviations.min(axis=1))
+    return middle
 
 
 def _follow(expression: Expression, nodes: Floats) -> tuple[Floats, Floats, Floats]:
