@@ -1,0 +1,199 @@
+"""From a canonical network to its level set as a checked mesh: traversal, welding and the cure of degenerate cases."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mn_onnx.extract.box_copies import drop_box_copies
+from mn_onnx.extract.contract import contract_short_edges
+from mn_onnx.extract.limit import SCALES, limit_surface
+from mn_onnx.extract.perturb import perturbation
+from mn_onnx.extract.schedule import Progress, TraversalStatistics, traverse
+from mn_onnx.extract.soup import PolygonSoup
+from mn_onnx.extract.surface import Surface
+from mn_onnx.extract.weld import weld
+from mn_onnx.ir.network import Network
+
+Floats = NDArray[np.float64]
+
+PERTURBATION_SIZES = (1e-9, 1e-10, 1e-11, 1e-8)
+"""Tried in this order: above the rounding of the traversal's bounds (about 1e-12), below the features of a network."""
+
+COINCIDENCE = 1e-11
+"""Vertices closer than this, relative to the box, are one point: above rounding, below a perturbation's size."""
+
+
+@dataclass(frozen=True)
+class Degeneracy:
+    """What was degenerate about a network in its box, and what was done about it.
+
+    ``found``: sentences that say what the exact traversal came upon; empty for an arrangement in general position.
+    ``perturbation``: the relative size of the shifts under which the mesh was found, None if none was needed; the
+    vertices have been taken back to the network as it is. ``displacement``: the farthest any vertex was taken back.
+    ``merged_vertices``, ``removed_polygons``: what coincided or had no area. ``box_copies``: polygons in a box face that
+    were left out. ``attempts``: perturbations tried.
+    """
+
+    found: tuple[str, ...] = ()
+    perturbation: float | None = None
+    displacement: float = 0.0
+    merged_vertices: int = 0
+    removed_polygons: int = 0
+    box_copies: int = 0
+    attempts: int = 0
+
+
+@dataclass(frozen=True, eq=False)
+class Extraction:
+    """The level set of a network, and how it was found.
+
+    ``statistics`` are those of the first traversal; ``seconds`` the time of each phase by name (traverse, weld, perturb).
+    """
+
+    surface: Surface
+    statistics: TraversalStatistics
+    degeneracy: Degeneracy
+    seconds: dict[str, float]
+
+
+@dataclass
+class _Run:
+    """One call's arguments and clock."""
+
+    lower: Floats
+    upper: Floats
+    threads: int | None
+    progress: Callable[[Progress], None] | None
+    on_phase: Callable[[str], None] | None
+    seconds: dict[str, float] = field(default_factory=dict)
+
+    @contextmanager
+    def phase(self, name: str) -> Iterator[None]:
+        if self.on_phase is not None:
+            self.on_phase(name)
+        started = time.perf_counter()
+        yield
+        self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - started
+
+    @property
+    def coincidence(self) -> float:
+        return COINCIDENCE * float(max(np.abs([self.lower, self.upper]).max(), (self.upper - self.lower).max()))
+
+
+def extract_surface(
+    network: Network,
+    lower: Floats,
+    upper: Floats,
+    *,
+    threads: int | None = None,
+    progress: Callable[[Progress], None] | None = None,
+    on_phase: Callable[[str], None] | None = None,
+) -> Extraction:
+    """The level set f = 0 of a canonical network in the open box ``lower``..``upper`` (float64 [3] each).
+
+    The surface is the boundary of {f < 0}: a polygon that lies in a face of the box is no part of it, and of a region
+    where f is zero throughout only the border with f < 0 is. Where {f < 0} touches itself in a point or an edge, the
+    mesh has vertices for each of the parts that touch.
+
+    A network in general position is traversed once, as it is. Where planes coincide or meet by design, the mesh is that
+    of a perturbed network in the limit of no perturbation (see `mn_onnx.extract.limit`). If no perturbation gives a
+    closed mesh the best one found is returned: ``surface.unmatched`` tells, and the caller must.
+
+    ``threads``: worker threads, all cores by default; the result is the same for any number. ``progress`` is called a
+    few times a second during traversals, ``on_phase`` with the name of each phase as it begins. Raises ``ValueError`` for
+    a network that is not canonical or an empty box.
+    """
+    run = _Run(np.asarray(lower, np.float64), np.asarray(upper, np.float64), threads, progress, on_phase)
+    with run.phase("traverse"):
+        soup, statistics = traverse(network, run.lower, run.upper, threads=threads, progress=progress)
+    with run.phase("weld"):
+        surface, found = _welded(soup, threads)
+        if not found:
+            surface, degeneracy = _cleaned(surface, run, 0.0, Degeneracy())
+            found = _troubles(surface)
+    if not found:
+        return Extraction(surface, statistics, degeneracy, run.seconds)
+    best, best_degeneracy = surface, Degeneracy(found)
+    with run.phase("perturb"):
+        for attempt, size in enumerate(PERTURBATION_SIZES):
+            candidate = _perturbed(network, run, size, attempt)
+            if candidate is None:
+                continue
+            surface, displacement = candidate
+            degeneracy = Degeneracy(found, perturbation=size, displacement=displacement, attempts=attempt + 1)
+            surface, degeneracy = _cleaned(surface, run, run.coincidence, degeneracy)
+            if not _troubles(surface):
+                return Extraction(surface, statistics, degeneracy, run.seconds)
+            if surface.unmatched.size < best.unmatched.size:
+                best, best_degeneracy = surface, degeneracy
+    best_degeneracy = replace(best_degeneracy, attempts=len(PERTURBATION_SIZES))
+    return Extraction(best, statistics, best_degeneracy, run.seconds)
+
+
+def _welded(soup: PolygonSoup, threads: int | None) -> tuple[Surface, tuple[str, ...]]:
+    """The surface of ``soup``, and what in it only rounding can have caused."""
+    soup, n_dropped = _whole_polygons(soup)
+    surface = weld(soup, threads=threads)
+    found = _troubles(surface)
+    if n_dropped:
+        found = (f"{n_dropped} polygons with fewer than 3 corners", *found)
+    return surface, found
+
+
+def _whole_polygons(soup: PolygonSoup) -> tuple[PolygonSoup, int]:
+    """The soup without polygons of fewer than three corners, and how many those were."""
+    sizes = np.diff(soup.offsets)
+    whole = sizes >= 3
+    if whole.all():
+        return soup, 0
+    corners = np.repeat(whole, sizes)
+    kept = PolygonSoup(
+        np.concatenate([np.zeros(1, np.int64), np.cumsum(sizes[whole])]),
+        soup.positions[corners],
+        soup.keys[corners],
+        soup.box_faces[corners],
+        soup.gradients[whole],
+        soup.errors[whole],
+    )
+    return kept, int(np.count_nonzero(~whole))
+
+
+def _troubles(surface: Surface) -> tuple[str, ...]:
+    """What an arrangement in general position never shows, a sentence each."""
+    counts = (
+        (surface.unmatched.size, "edges inside the box without neighbour"),
+        (int(surface.report["position_disagreements"]), "corners apart from their vertex"),
+    )
+    return tuple(f"{count} {what}" for count, what in counts if count)
+
+
+def _cleaned(surface: Surface, run: _Run, length: float, degeneracy: Degeneracy) -> tuple[Surface, Degeneracy]:
+    """The surface without edges of at most ``length``, polygons without area and copies of box faces."""
+    measures = surface.measures
+    if (measures.shortest_edges <= length).any() or (measures.areas <= length * measures.perimeters).any():
+        surface, contraction = contract_short_edges(surface, length)
+        degeneracy = replace(
+            degeneracy,
+            merged_vertices=contraction.merged_vertices,
+            removed_polygons=contraction.removed_polygons,
+        )
+    surface, box_copies = drop_box_copies(surface, run.lower, run.upper, run.coincidence)
+    return surface, replace(degeneracy, box_copies=box_copies)
+
+
+def _perturbed(network: Network, run: _Run, size: float, seed: int) -> tuple[Surface, float] | None:
+    """The mesh in the limit of a perturbation, and the largest displacement; None if ``size`` is not small enough."""
+    shifts = perturbation(network, run.lower, run.upper, size=size, seed=seed)
+    soups, surfaces = [], []
+    for scale in SCALES:
+        soup, _ = traverse(shifts.at(scale), run.lower, run.upper, threads=run.threads, progress=run.progress)
+        soup, _ = _whole_polygons(soup)
+        soups.append(soup)
+        surfaces.append(weld(soup, threads=run.threads))
+    return limit_surface((soups[0], soups[1]), (surfaces[0], surfaces[1]))
