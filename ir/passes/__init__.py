@@ -6,29 +6,34 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
+from mn_onnx.ir.certify import Certificate, certify
 from mn_onnx.ir.network import Floats, Network
 from mn_onnx.ir.passes.contract import Pass, Program
 from mn_onnx.ir.passes.fuse_affine import FUSE_AFFINE
 from mn_onnx.ir.passes.merge_proportional import MERGE_PROPORTIONAL
 from mn_onnx.ir.passes.recognise import RECOGNISE
+from mn_onnx.ir.passes.refine import ToleranceNotReached, refine
 from mn_onnx.ir.passes.strip_heads import STRIP_HEADS
 from mn_onnx.ir.passes.subtract_level import SUBTRACT_LEVEL
 from mn_onnx.ir.passes.tabulate import TABULATE
 from mn_onnx.ir.passes.unused import REMOVE_UNUSED
 from mn_onnx.ir.spec import CANONICAL, IMPORTED, verify
 
-PASSES: tuple[Pass, ...] = (
+# Everything but the tables ...
+LOWERING: tuple[Pass, ...] = (
     RECOGNISE,
     FUSE_AFFINE,
     STRIP_HEADS,
     SUBTRACT_LEVEL,
     REMOVE_UNUSED,
     MERGE_PROPORTIONAL,
-    TABULATE,
 )
+# ... and all of it. Refinement repeats the last pass.
+PASSES: tuple[Pass, ...] = (*LOWERING, TABULATE)
 
 
 @dataclass(frozen=True)
@@ -52,6 +57,7 @@ class Canonical:
     imported network. ``level``: the level asked for. ``lower``, ``upper``: the box, float64 [input_dim]; surrogates and
     their errors hold inside. ``sign``: -1 if ``network`` is the negated pre-activation of a decreasing head, else 1.
     ``empty_reason``: why the level set is known to be empty, else "". ``steps``: the passes that ran.
+    ``refined``: the proof that refinement ended with, None if no tolerance was asked for.
     """
 
     network: Network
@@ -62,6 +68,21 @@ class Canonical:
     sign: int
     empty_reason: str
     steps: tuple[Step, ...]
+    refined: Certificate | None = None
+
+    @cached_property
+    def certificate(self) -> Certificate:
+        """A proved bound on ``|f_true - f|`` on the box, computed when first asked for (up to a few seconds).
+
+        ``f`` is the canonical network's value (the pre-activation of a stripped head); the error is zero for exact
+        networks.
+        """
+        return self.refined or certify(self.network, self.lower, self.upper)
+
+    @property
+    def surrogate_eps(self) -> float:
+        """The certificate's bound on ``|f_true - f|`` on the box."""
+        return self.certificate.error
 
     @property
     def is_exact(self) -> bool:
@@ -99,15 +120,18 @@ def canonicalize(
     lower: Floats,
     upper: Floats,
     level: float = 0.0,
+    surrogate_tol: float | None = None,
     knots_per_period: float | None = None,
 ) -> Canonical:
     """The canonical form of ``{x in box | network(x) = level}``.
 
     ``lower``, ``upper``: the box, float64 [input_dim]. ``knots_per_period``: how finely surrogates follow smooth
-    functions (knots on every two lobes of curvature; default 16).
+    functions (knots on every two lobes of curvature; default 16). ``surrogate_tol``: refine them until the certified
+    error of the canonical network's value on the box is at most this.
 
-    Raises `InvalidNetwork` for a network against the grammar, ``ValueError`` for an invalid box or option, and
-    `PassFailed` if a unit's function jumps, is unbounded or undefined on its range (the unit is named).
+    Raises `InvalidNetwork` for a network against the grammar, ``ValueError`` for an invalid box or option,
+    `PassFailed` if a unit's function jumps, is unbounded or undefined on its range (the unit is named), and
+    `ToleranceNotReached` with the reason if ``surrogate_tol`` cannot be certified.
     """
     verify(network, IMPORTED, "as imported")
     lower, upper = np.asarray(lower, np.float64), np.asarray(upper, np.float64)
@@ -115,10 +139,31 @@ def canonicalize(
         raise ValueError(f"the level must be a finite number, not {level}")
     if knots_per_period is not None and not knots_per_period >= 1:
         raise ValueError(f"knots_per_period must be at least 1, not {knots_per_period}")
+    if surrogate_tol is not None and not surrogate_tol > 0:
+        raise ValueError(f"surrogate_tol must be positive, not {surrogate_tol}")
     program = Program(network, lower, upper, float(level))
     if knots_per_period is not None:
         program = replace(program, knots_per_period=float(knots_per_period))
-    program, steps = run_passes(program, PASSES)
-    if not program.empty_reason:
-        verify(program.network, CANONICAL, "as canonical")
-    return Canonical(program.network, network, float(level), lower, upper, program.sign, program.empty_reason, steps)
+    lowered, lowering_steps = run_passes(program, LOWERING)
+    program, table_steps = run_passes(lowered, (TABULATE,))
+    refined = None
+    if surrogate_tol is not None:
+        program, refined = refine(lowered, program, surrogate_tol)
+    verify(program.network, CANONICAL, "as canonical")
+    return Canonical(
+        program.network,
+        network,
+        float(level),
+        lower,
+        upper,
+        program.sign,
+        program.empty_reason,
+        (*lowering_steps, *table_steps),
+        refined,
+    )
+
+
+__all__ = [
+    "LOWERING", "PASSES", "Canonical", "Pass", "PassFailed", "Program", "Step", "ToleranceNotReached", "canonicalize",
+    "run_passes",
+]  # fmt: skip

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from typing import Any
 
 from mn_onnx.ir.network import Floats, Network
 from mn_onnx.ir.spec import Property
@@ -27,7 +28,7 @@ class Program:
     sign: int = 1
     empty_reason: str = ""
     knots_per_period: float = 16.0
-    tolerances: Mapping[Hashable, tuple[float, ...]] = field(default_factory=dict)
+    tolerances: Mapping[Any, tuple[float, ...]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
