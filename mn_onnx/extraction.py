@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from mn_onnx.errors import CheckFailed, UsageError
 from mn_onnx.extract.invariants import Invariants, check_invariants
 from mn_onnx.extract.schedule import Progress, TraversalStatistics, traverse
+from mn_onnx.extract.soup import PolygonSoup
 from mn_onnx.extract.surface import Surface
 from mn_onnx.extract.weld import weld
 from mn_onnx.model import LoadOptions, Model, load
@@ -87,9 +88,12 @@ def extract(
     with phases.phase("compile"):
         warm_up(model.dimension)
     with phases.phase("traverse"):
-        soup, statistics = traverse(
-            model.network, model.lower, model.upper, threads=threads, progress=_traversal_listener(phases)
-        )
+        if model.canonical.empty_reason:
+            soup, statistics = empty_soup(model.dimension), TraversalStatistics()
+        else:
+            soup, statistics = traverse(
+                model.network, model.lower, model.upper, threads=threads, progress=_traversal_listener(phases)
+            )
     with phases.phase("weld"):
         surface = weld(soup, threads=threads)
         del soup
@@ -150,15 +154,29 @@ def findings(
     return problems, notes
 
 
+def empty_soup(dimension: int) -> PolygonSoup:
+    """What a traversal gives that finds nothing."""
+    return PolygonSoup(
+        offsets=np.zeros(1, np.int64),
+        positions=np.empty((0, dimension)),
+        keys=np.empty((0, 2), np.uint64),
+        box_faces=np.empty(0, np.int8),
+        gradients=np.empty((0, dimension)),
+        errors=np.empty(0),
+    )
+
+
 def empty_level_set(model: Model) -> str:
-    """Why there is nothing to extract, with the certified range of f and the level nearest to the asked one."""
-    low, high = model.output_range
-    sign = "positive" if low >= 0 else "negative" if high <= 0 else "of one sign"
+    """Why there is nothing to extract, with the certified range of f and the value nearest to the level."""
+    reason = model.canonical.empty_reason
+    if not reason:
+        low, high = model.output_range
+        reason = f"f, which is zero on it, is certified within {low:.6g} to {high:.6g} in the box"
     values = model.evaluate(_grid(model))
     nearest = values[np.abs(values - model.level).argmin()]
     return (
-        f"the level set is empty: f - level is {sign} in the box (certified range {low:.6g} to {high:.6g}); "
-        f"the output comes nearest to {model.level:g} with {nearest:.6g}, found on a grid; try --level or --bounds"
+        f"the level set is empty: {reason}; of the output's values on a grid, {nearest:.6g} is the nearest to the level "
+        f"{model.level:g}; try another level or larger bounds"
     )
 
 

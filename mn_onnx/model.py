@@ -11,12 +11,13 @@ from typing import TypedDict, Unpack
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mn_onnx.errors import UsageError
+from mn_onnx.errors import ModelRefused, Problem, UsageError
 from mn_onnx.importer import Imported, import_network
 from mn_onnx.ir.bounds import output_bounds
+from mn_onnx.ir.certify import certified_error
 from mn_onnx.ir.evaluate import evaluate
 from mn_onnx.ir.network import Network
-from mn_onnx.ir.passes import Canonical, canonicalize
+from mn_onnx.ir.passes import Canonical, PassFailed, canonicalize
 from mn_onnx.options import DEFAULT_BOUNDS, bounds_from_metadata, box, output_and_channel
 from mn_onnx.reader import ModelSource, ReadModel, read_model
 
@@ -75,12 +76,12 @@ class Model:
     @property
     def exact(self) -> bool:
         """Whether the network is piecewise linear as it stands, so that no surrogate stands in for an activation."""
-        return self.canonical.exact
+        return self.canonical.is_exact
 
-    @property
+    @cached_property
     def surrogate_eps(self) -> float:
-        """A proved bound on |f_true - f| in the box; zero for exact networks."""
-        return self.canonical.surrogate_eps
+        """A proved bound on |f_true - f| in the box, of the canonical f; zero for exact networks."""
+        return certified_error(self.network, self.lower, self.upper)
 
     @cached_property
     def output_range(self) -> tuple[float, float]:
@@ -109,9 +110,13 @@ def load(source: ModelSource, **options: Unpack[LoadOptions]) -> Model:
     or holds what cannot be extracted.
     """
     started = time.perf_counter()
-    level = options.get("level", 0.0)
+    level, knots, tolerance = options.get("level", 0.0), options.get("knots_per_period"), options.get("surrogate_tol")
     if not np.isfinite(level):
         raise UsageError(f"the level {level} is not a finite number")
+    if knots is not None and not 1 <= knots < np.inf:
+        raise UsageError(f"knots_per_period must be at least 1, not {knots}")
+    if tolerance is not None and not 0 < tolerance < np.inf:
+        raise UsageError(f"surrogate_tol must be a positive number, not {tolerance}")
     read = read_model(source)
     output, channel = output_and_channel(options.get("output"), [value.name for value in read.model.graph.output])
     imported = import_network(
@@ -126,12 +131,16 @@ def load(source: ModelSource, **options: Unpack[LoadOptions]) -> Model:
         bounds = bounds_from_metadata(imported.metadata) or DEFAULT_BOUNDS
     lower, upper = box(bounds, imported.input_dim)
     read_in = time.perf_counter()
-    canonical = canonicalize(
-        imported.network,
-        level=level,
-        bounds=(lower, upper),
-        surrogate_tol=options.get("surrogate_tol"),
-        knots_per_period=options.get("knots_per_period"),
-    )
+    try:
+        canonical = canonicalize(
+            imported.network,
+            lower=lower,
+            upper=upper,
+            level=level,
+            knots_per_period=knots,
+        )
+    except PassFailed as error:
+        remedy = "choose smaller --bounds, or export the network with activations that are defined everywhere"
+        raise ModelRefused([Problem("", "", 0, str(error), remedy)]) from error
     seconds = {"import": read_in - started, "lower": time.perf_counter() - read_in}
     return Model(read, imported, canonical, level, lower, upper, seconds)

@@ -5,11 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import onnx
 from numpy.typing import NDArray
 
 from mn_onnx.ir.evaluate import evaluate, float32_error_bound
+from mn_onnx.layout import PointInput
 from mn_onnx.model import Model
 from mn_onnx.runtime import Runtime
+from mn_onnx.tensors import model_tensors
 
 Floats = NDArray[np.float64]
 
@@ -18,6 +21,12 @@ NEAR_SURFACE_POINTS = 2048
 BISECTIONS = 20
 BATCH_SIZES = (1, 2, 7)
 """Besides one large batch: a network whose value at a point depends on the other points differs between them."""
+
+UNIT_ROUNDOFF = {
+    onnx.TensorProto.FLOAT: 2.0**-24,
+    onnx.TensorProto.FLOAT16: 2.0**-11,
+    onnx.TensorProto.BFLOAT16: 2.0**-8,
+}
 
 
 @dataclass(frozen=True)
@@ -70,7 +79,8 @@ def check_parity(model: Model, runtime: Runtime, *, seed: int = 0) -> Parity:
     difference = np.abs(np.concatenate(theirs) - ours[index])
     # A result that is not a number agrees with nothing.
     difference[np.isnan(difference)] = np.inf
-    allowed = float32_error_bound(model.imported.network, points)[index]
+    unit = coarsest_rounding(model.read.model)
+    allowed = float32_error_bound(model.imported.network, points, unit_roundoff=unit)[index]
     with np.errstate(divide="ignore", invalid="ignore"):
         ratio = np.where(difference == 0, 0.0, difference / allowed)
     return Parity(
@@ -78,10 +88,24 @@ def check_parity(model: Model, runtime: Runtime, *, seed: int = 0) -> Parity:
     )
 
 
+def coarsest_rounding(model: onnx.ModelProto) -> float:
+    """The unit roundoff of the least precise number format that the model computes with, at least that of float32."""
+    types = {stored.tensor.data_type for stored in model_tensors(model)}
+    types |= {value.type.tensor_type.elem_type for value in (*model.graph.input, *model.graph.output)}
+    types |= {
+        attribute.i
+        for node in model.graph.node
+        if node.op_type == "Cast"
+        for attribute in node.attribute
+        if attribute.name == "to"
+    }
+    return max(UNIT_ROUNDOFF.get(data_type, 0.0) for data_type in (*types, onnx.TensorProto.FLOAT))
+
+
 def probe_points(model: Model, *, seed: int = 0) -> Floats:
     """Points of the box, float64 [n, dimension]: uniform, corners, and pairs bisected onto the level set.
 
-    All are rounded to float32 first, so that a runtime of lower precision is fed the same points.
+    All are rounded to the number formats of the inputs, so that a runtime is fed the same points.
     """
     generator = np.random.default_rng(seed)
     uniform = generator.uniform(model.lower, model.upper, (UNIFORM_POINTS, model.dimension))
@@ -96,7 +120,10 @@ def probe_points(model: Model, *, seed: int = 0) -> Floats:
             outside[generator.integers(len(outside), size=NEAR_SURFACE_POINTS)],
         )
     points = np.concatenate([uniform, near, corners])
-    return points.astype(np.float32).astype(np.float64)
+    for entry in model.imported.layout.inputs:
+        if isinstance(entry, PointInput):
+            points = points.astype(entry.dtype).astype(np.float64)
+    return points
 
 
 def bisect(model: Model, inside: Floats, outside: Floats) -> Floats:

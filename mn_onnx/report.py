@@ -24,6 +24,8 @@ from dataclasses import asdict
 from importlib.metadata import version
 from typing import Any
 
+import numpy as np
+
 from mn_onnx import __version__
 from mn_onnx.extract.invariants import Invariants
 from mn_onnx.extract.schedule import TraversalStatistics
@@ -80,7 +82,10 @@ def build_report(
         **check_entries(parity, residuals),
         "nodes": statistics.nodes,
         "threads": statistics.threads,
-        "traversal": asdict(statistics),
+        "traversal": {
+            name: value.tolist() if isinstance(value, np.ndarray) else value
+            for name, value in asdict(statistics).items()
+        },
         "seconds": dict(seconds),
         "problems": list(problems),
         "notes": list(notes),
