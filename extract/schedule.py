@@ -264,7 +264,7 @@ def traverse(
                 while not worker.run(task, BUDGET if not pool.wants_more() else BUDGET // 50):
                     if pool.wants_more() and (given := worker.give_away()) is not None:
                         pool.put(task, given)
-        except BaseException as error:  # whatever it is, the caller gets it
+        except BaseException as error:  # noqa: BLE001 - whatever it is, the caller gets it
             pool.fail(error)
 
     crew = [threading.Thread(target=work, args=(worker,), daemon=True) for worker in workers]

@@ -1,8 +1,8 @@
 """Bounds of every unit and of the output over a cell, and the states that follow from them.
 
-Each pre-activation is enclosed by a linear centre and a radius, ``|t - c(x)| <= r``, evaluated at the cell's own vertices
-(a linear function is extreme there). A unit of several pieces is relaxed by its chord over the range of ``t``. The
-output is bounded by a backward pass over the same chords, as in CROWN (Zhang et al., NeurIPS 2018).
+Each pre-activation is enclosed by a linear centre and a radius, ``|t - c(x)| <= r``, evaluated at the cell's own
+vertices (a linear function is extreme there). A unit of several pieces is relaxed by its chord over the range of ``t``.
+The output is bounded by a backward pass over the same chords, as in CROWN (Zhang et al., NeurIPS 2018).
 """
 
 from __future__ import annotations
@@ -59,7 +59,10 @@ def row_extremes(F, N, X, M, cell, begin, end):
 
 @njit(cache=True, error_model="numpy")
 def relax_piece_range(knots, slopes, intercepts, knot, piece, first, last, low, high):
-    """Chord over [low, high] of a table's pieces ``first..last``: slope, offset, error with |y - slope t - offset| <= error."""
+    """Relax a table's pieces ``first..last`` by their chord over [low, high].
+
+    Returns slope, offset and error with ``|y - slope t - offset| <= error``.
+    """
     if first == last:
         return slopes[piece + first], intercepts[piece + first], 0.0
     at_low = slopes[piece + first] * low + intercepts[piece + first]
@@ -145,7 +148,35 @@ def read_outputs(F, X, J, M, floats, rows, begin, end, first, count):
     weights = floats + 4 * rows
     outputs = OUTPUTS * M
     places = READ_AT * M
-    for r in range(begin, end, 4):
+    r = begin
+    while r + 8 <= end:
+        c0, c1 = load(F, floats + r), load(F, floats + rows + r)
+        c2, c3 = load(F, floats + 2 * rows + r), load(F, floats + 3 * rows + r)
+        d0, d1 = load(F, floats + r + 4), load(F, floats + rows + r + 4)
+        d2, d3 = load(F, floats + 2 * rows + r + 4), load(F, floats + 3 * rows + r + 4)
+        c4, d4 = splat(0.0), splat(0.0)
+        for p in range(first, count):
+            at = weights + J[places + p] + r
+            w, v = load(F, at), load(F, at + 4)
+            y = outputs + 8 * p
+            y0, y1, y2, y3, y4 = splat(X[y]), splat(X[y + 1]), splat(X[y + 2]), splat(X[y + 3]), splat(X[y + 4])
+            c0, d0 = fma(w, y0, c0), fma(v, y0, d0)
+            c1, d1 = fma(w, y1, c1), fma(v, y1, d1)
+            c2, d2 = fma(w, y2, c2), fma(v, y2, d2)
+            c3, d3 = fma(w, y3, c3), fma(v, y3, d3)
+            c4, d4 = fma(magnitude(w), y4, c4), fma(magnitude(v), y4, d4)
+        store(X, r, c0)
+        store(X, M + r, c1)
+        store(X, 2 * M + r, c2)
+        store(X, 3 * M + r, c3)
+        store(X, RADIUS * M + r, c4)
+        store(X, r + 4, d0)
+        store(X, M + r + 4, d1)
+        store(X, 2 * M + r + 4, d2)
+        store(X, 3 * M + r + 4, d3)
+        store(X, RADIUS * M + r + 4, d4)
+        r += 8
+    if r < end:
         c0, c1 = load(F, floats + r), load(F, floats + rows + r)
         c2, c3 = load(F, floats + 2 * rows + r), load(F, floats + 3 * rows + r)
         radius = splat(0.0)
@@ -168,14 +199,14 @@ def read_outputs(F, X, J, M, floats, rows, begin, end, first, count):
 def bound_units(F, N, X, J, M, tables, cell, system, floats):
     """Forward pass: bounds, states and relaxations of all rows of the system over the cell.
 
-    Reads the row states in J (STATE_LOW, STATE_HIGH) and narrows them. Returns the number of unstable rows.
+    Reads the row states in J (STATE_LOW, STATE_HIGH) and narrows them.
     """
     rows, cols, levels = N[system + SYS_ROWS], N[system + SYS_COLS], N[system + SYS_LEVELS]
     level_start = system + SYS_HEADER
     row_unit = level_start + levels + 1
     row_col = row_unit + rows
     col_end = row_col + rows + 1 + 2 * cols
-    unstable, first, count = 0, 0, 0
+    first, count = 0, 0
     for level in range(levels):
         begin, end = N[level_start + level], N[level_start + level + 1]
         # The outputs that no later row reads are at the front: extents only grow with the level.
@@ -188,10 +219,7 @@ def bound_units(F, N, X, J, M, tables, cell, system, floats):
             if unit < 0:
                 continue
             settle_row(N, X, J, M, tables, row_col, r, unit)
-            if J[STATE_LOW * M + r] < J[STATE_HIGH * M + r]:
-                unstable += 1
             count = remember_outputs(N, X, J, M, row_col, rows, r, count)
-    return unstable
 
 
 @njit(cache=True, error_model="numpy")

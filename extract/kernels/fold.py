@@ -1,8 +1,9 @@
 """Folding: substitute the settled units of a system into the later ones, and leave them out.
 
-A settled unit is affine in its pre-activation, y = s t + o, so its row can be put in its place wherever it is read.
-First the settled rows are expressed over the unstable columns (a triangular substitution), then every unstable row
-receives the settled rows it reads: a product of two dense matrices, done in blocks of lanes.
+A settled unit whose output is zero is simply left out. Any other settled unit is affine in its pre-activation,
+y = s t + o, so its row can be put in its place wherever it is read. First the settled rows are expressed over the kept
+columns (a triangular substitution, level by level), then every kept row receives the settled rows it reads: products
+of dense matrices, in register tiles.
 """
 
 from __future__ import annotations
@@ -11,8 +12,8 @@ from numba import njit
 
 from mn_onnx.extract.kernels.lanes import fma, load, splat, store
 from mn_onnx.extract.kernels.memory import (
-    FORMS,
     KEPT_ROWS,
+    KIND,
     NEW_INDEX,
     OFFSET,
     SLOPE,
@@ -32,13 +33,38 @@ from mn_onnx.extract.kernels.memory import (
     system_ints,
 )
 
+DEAD, LINEAR, UNSTABLE = 0, 1, 2
+
 
 @njit(cache=True, error_model="numpy")
-def lay_out_folded(N, J, M, system, folded):
-    """Write the integer part of the system that keeps the unstable rows only, at ``folded``.
+def classify_rows(N, X, J, M, system):
+    """J[KIND] of every row: UNSTABLE, LINEAR (settled) or DEAD (settled, output zero). Counts the last two."""
+    rows = N[system + SYS_ROWS]
+    row_unit = system + SYS_HEADER + N[system + SYS_LEVELS] + 1
+    row_col = row_unit + rows
+    linear, dead = 0, 0
+    for r in range(rows):
+        if N[row_unit + r] < 0:
+            continue
+        if J[STATE_LOW * M + r] < J[STATE_HIGH * M + r]:
+            J[KIND * M + r] = UNSTABLE
+            continue
+        kind = DEAD
+        for c in range(N[row_col + r], N[row_col + r + 1]):
+            if X[SLOPE * M + c] != 0.0 or X[OFFSET * M + c] != 0.0:
+                kind = LINEAR
+        J[KIND * M + r] = kind
+        linear += kind
+        dead += 1 - kind
+    return linear, dead
 
-    J[KEPT_ROWS] gives the old row of every new one , repeated where padded, J[NEW_INDEX] the new row of every old one.
-    Returns the new numbers of rows and columns.
+
+@njit(cache=True, error_model="numpy")
+def lay_out_folded(N, J, M, system, folded, least):
+    """Write the integer part of the system that keeps the rows of kind ``least`` or more, at ``folded``.
+
+    J[KEPT_ROWS] gives the old row of every new one, repeated where padded, J[NEW_INDEX] the new row of every old one
+    (of one that is left out: of the next). Returns the new numbers of rows and columns.
     """
     rows, levels = N[system + SYS_ROWS], N[system + SYS_LEVELS]
     level_start = system + SYS_HEADER
@@ -50,9 +76,9 @@ def lay_out_folded(N, J, M, system, folded):
     for level in range(levels):
         begin = new_rows
         for r in range(N[level_start + level], N[level_start + level + 1]):
-            if N[row_unit + r] >= 0 and J[STATE_LOW * M + r] < J[STATE_HIGH * M + r]:
+            J[NEW_INDEX * M + r] = new_rows
+            if N[row_unit + r] >= 0 and J[KIND * M + r] >= least:
                 J[KEPT_ROWS * M + new_rows] = r
-                J[NEW_INDEX * M + r] = new_rows
                 new_rows += 1
                 new_units += 1
                 new_cols += N[row_col + r + 1] - N[row_col + r]
@@ -74,6 +100,7 @@ def lay_out_folded(N, J, M, system, folded):
     col_row = new_row_col + new_rows + 1
     col_begin = col_row + new_cols
     col_end = col_begin + new_cols
+    old_col_end = row_col + rows + 1 + 2 * N[system + SYS_COLS]
     c = 0
     level = 0
     for q in range(new_rows):
@@ -84,105 +111,94 @@ def lay_out_folded(N, J, M, system, folded):
         real = q == 0 or r != J[KEPT_ROWS * M + q - 1]
         N[new_unit + q] = N[row_unit + r] if real else -1
         if real:
-            for _ in range(N[row_col + r], N[row_col + r + 1]):
+            for old in range(N[row_col + r], N[row_col + r + 1]):
                 N[col_row + c] = q
                 N[col_begin + c] = N[new_level_start + level + 1]
-                N[col_end + c] = new_rows
+                end = N[old_col_end + old]
+                if least == UNSTABLE or end == rows:
+                    N[col_end + c] = new_rows  # substitution fills the column
+                else:
+                    N[col_end + c] = max(padded(J[NEW_INDEX * M + end]), N[col_begin + c])
                 c += 1
     N[new_row_col + new_rows] = c
     return new_rows, new_cols
 
 
 @njit(cache=True, error_model="numpy")
-def list_settled_columns(F, N, X, J, M, system, floats):
-    """J[STABLE_COLS]: the columns of settled rows whose output is not identically zero; returns their number."""
+def list_settled_columns(N, X, J, M, system, least):
+    """J[STABLE_COLS]: the columns, not identically zero, of rows of a kind below ``least``; returns their number."""
     rows, cols = N[system + SYS_ROWS], N[system + SYS_COLS]
     col_row = system + SYS_HEADER + N[system + SYS_LEVELS] + 1 + rows + rows + 1
     count = 0
     for c in range(cols):
         r = N[col_row + c]
-        if J[STATE_LOW * M + r] == J[STATE_HIGH * M + r] and (X[SLOPE * M + c] != 0.0 or X[OFFSET * M + c] != 0.0):
+        if J[KIND * M + r] < least and (X[SLOPE * M + c] != 0.0 or X[OFFSET * M + c] != 0.0):
             J[STABLE_COLS * M + count] = c
             count += 1
     return count
 
 
 @njit(cache=True, error_model="numpy")
-def substitute(F, X, target, length, table, count, coefficients):
-    """F[target + k] += sum_p X[coefficients + p] * F[table + p * length + k] for all k < length."""
-    k = 0
-    while k + 16 <= length:
-        a, b = load(F, target + k), load(F, target + k + 4)
-        c, d = load(F, target + k + 8), load(F, target + k + 12)
-        source = table + k
-        for p in range(count):
-            w = splat(X[coefficients + p])
-            a = fma(w, load(F, source), a)
-            b = fma(w, load(F, source + 4), b)
-            c = fma(w, load(F, source + 8), c)
-            d = fma(w, load(F, source + 12), d)
-            source += length
-        store(F, target + k, a)
-        store(F, target + k + 4, b)
-        store(F, target + k + 8, c)
-        store(F, target + k + 12, d)
-        k += 16
-    while k < length:
-        a = load(F, target + k)
-        source = table + k
-        for p in range(count):
-            a = fma(splat(X[coefficients + p]), load(F, source), a)
-            source += length
-        store(F, target + k, a)
-        k += 4
-
-
-@njit(cache=True, error_model="numpy")
-def express_settled_rows(F, N, X, J, M, system, floats, settled, new_cols, folded, work, stride):
-    """Every settled column's output over the unstable columns and the input.
-
-    Row ``p`` of the table at ``F[work]``, ``stride`` apart: weights on the new columns, then (padded) the four affine
-    coefficients.
-    """
+def read_settled_row(F, N, X, J, M, system, floats, p, new_cols, folded, at, stride):
+    """What settled column ``p`` reads of the kept columns and the input, times its slope: F[at : at + stride]."""
     rows, cols = N[system + SYS_ROWS], N[system + SYS_COLS]
     row_col = system + SYS_HEADER + N[system + SYS_LEVELS] + 1 + rows
     col_row = row_col + rows + 1
     col_begin = col_row + cols
     new_rows = N[folded + SYS_ROWS]
-    new_col_row = folded + SYS_HEADER + N[folded + SYS_LEVELS] + 1 + 2 * new_rows + 1
-    new_row_col = new_col_row - new_rows - 1
+    new_row_col = folded + SYS_HEADER + N[folded + SYS_LEVELS] + 1 + new_rows
+    new_col_row = new_row_col + new_rows + 1
     weights = floats + 4 * rows
     affine = padded(new_cols)
-    for p in range(settled):
-        c = J[STABLE_COLS * M + p]
-        r = N[col_row + c]
-        slope = X[SLOPE * M + c]
-        at = work + p * stride
-        for k in range(0, stride, 4):
-            store(F, at + k, splat(0.0))
-        if slope == 0.0:
-            F[at + affine + 3] = X[OFFSET * M + c]
-            continue
-        for k in range(new_cols):
-            q = N[new_col_row + k]
-            old = N[row_col + J[KEPT_ROWS * M + q]] + k - N[new_row_col + q]
-            if N[col_begin + old] > r:
-                break
-            F[at + k] = F[weights + old * rows + r]
-        for axis in range(4):
-            F[at + affine + axis] = F[floats + axis * rows + r]
-        readers = 0
-        for e in range(p):
-            earlier = J[STABLE_COLS * M + e]
-            reads = N[col_begin + earlier] <= r
-            X[FORMS * M + e] = F[weights + earlier * rows + r] if reads else 0.0
-            readers = e + 1 if reads else readers
-        substitute(F, X, at, stride, work, readers, FORMS * M)
-        factor = splat(slope)
-        zero = splat(0.0)
-        for k in range(0, stride, 4):
-            store(F, at + k, fma(factor, load(F, at + k), zero))
-        F[at + affine + 3] += X[OFFSET * M + c]
+    c = J[STABLE_COLS * M + p]
+    r = N[col_row + c]
+    slope = X[SLOPE * M + c]
+    for k in range(0, stride, 4):
+        store(F, at + k, splat(0.0))
+    for k in range(new_cols):
+        q = N[new_col_row + k]
+        old = N[row_col + J[KEPT_ROWS * M + q]] + k - N[new_row_col + q]
+        if N[col_begin + old] > r:
+            break
+        F[at + k] = slope * F[weights + old * rows + r]
+    for axis in range(4):
+        F[at + affine + axis] = slope * F[floats + axis * rows + r]
+    F[at + affine + 3] += X[OFFSET * M + c]
+
+
+@njit(cache=True, error_model="numpy")
+def express_settled_rows(F, N, X, J, M, system, floats, settled, new_cols, folded, work, stride, scratch):
+    """Every settled column's output over the kept columns and the input.
+
+    Row ``p`` of the table at ``F[work]``, ``stride`` apart: weights on the new columns, then (padded) the four affine
+    coefficients. Level by level: those of one level read only settled columns of earlier ones, all in one product.
+    """
+    rows, cols = N[system + SYS_ROWS], N[system + SYS_COLS]
+    col_row = system + SYS_HEADER + N[system + SYS_LEVELS] + 1 + 2 * rows + 1
+    col_begin = col_row + cols
+    weights = floats + 4 * rows
+    first = 0
+    while first < settled:
+        level_end = N[col_begin + J[STABLE_COLS * M + first]]
+        last = first
+        while last < settled and N[col_begin + J[STABLE_COLS * M + last]] == level_end:
+            read_settled_row(F, N, X, J, M, system, floats, last, new_cols, folded, work + last * stride, stride)
+            last += 1
+        width = last - first
+        for e in range(first):
+            source = weights + J[STABLE_COLS * M + e] * rows
+            target = scratch + e * width - first
+            for p in range(first, last):
+                c = J[STABLE_COLS * M + p]
+                F[target + p] = X[SLOPE * M + c] * F[source + N[col_row + c]]
+        p = first
+        while p + 4 <= last:
+            accumulate_four(F, work + p * stride, 0, stride, work, 0, first, scratch + p - first, width)
+            p += 4
+        while p < last:
+            accumulate(F, work + p * stride, 0, stride, stride, work, 0, first, scratch + p - first, width)
+            p += 1
+        first = last
 
 
 @njit(cache=True, error_model="numpy")
@@ -194,57 +210,94 @@ def gather_column(F, J, M, source, begin, rows, target):
 
 
 @njit(cache=True, error_model="numpy")
-def accumulate(F, target, begin, rows, gathered, first, count, coefficients, stride):
+def accumulate(F, target, begin, end, rows, gathered, first, count, coefficients, stride):
     """F[target + q] += sum_p F[coefficients + p * stride] * F[gathered + p * rows + q].
 
-    Over rows ``begin <= q < rows`` and settled columns ``first <= p < count``.
+    Over rows ``begin <= q < end`` and settled columns ``first <= p < count``.
     """
-    q = begin
-    while q + 16 <= rows:
-        a, b = load(F, target + q), load(F, target + q + 4)
-        c, d = load(F, target + q + 8), load(F, target + q + 12)
-        source = gathered + first * rows + q
-        for p in range(first, count):
-            w = splat(F[coefficients + p * stride])
-            a = fma(w, load(F, source), a)
-            b = fma(w, load(F, source + 4), b)
-            c = fma(w, load(F, source + 8), c)
-            d = fma(w, load(F, source + 12), d)
-            source += rows
-        store(F, target + q, a)
-        store(F, target + q + 4, b)
-        store(F, target + q + 8, c)
-        store(F, target + q + 12, d)
-        q += 16
-    while q < rows:
+    for q in range(begin, end, 4):
         a = load(F, target + q)
         source = gathered + first * rows + q
         for p in range(first, count):
             a = fma(splat(F[coefficients + p * stride]), load(F, source), a)
             source += rows
         store(F, target + q, a)
-        q += 4
 
 
 @njit(cache=True, error_model="numpy")
-def fold(F, N, X, J, M, system, floats, folded, folded_floats):
+def accumulate_four(F, target, begin, rows, gathered, first, count, coefficients, stride):
+    """`accumulate` for four targets, ``rows`` apart, whose coefficients are neighbours: a register tile of 4 x 8."""
+    q = begin
+    if (rows - q) & 7:
+        for k in range(4):
+            accumulate(F, target + k * rows, q, q + 4, rows, gathered, first, count, coefficients + k, stride)
+        q += 4
+    while q < rows:
+        t0, t1, t2, t3 = target + q, target + rows + q, target + 2 * rows + q, target + 3 * rows + q
+        a0, b0, a1, b1 = load(F, t0), load(F, t0 + 4), load(F, t1), load(F, t1 + 4)
+        a2, b2, a3, b3 = load(F, t2), load(F, t2 + 4), load(F, t3), load(F, t3 + 4)
+        source = gathered + first * rows + q
+        at = coefficients + first * stride
+        for _ in range(first, count):
+            u, v = load(F, source), load(F, source + 4)
+            w0, w1, w2, w3 = splat(F[at]), splat(F[at + 1]), splat(F[at + 2]), splat(F[at + 3])
+            a0, b0 = fma(w0, u, a0), fma(w0, v, b0)
+            a1, b1 = fma(w1, u, a1), fma(w1, v, b1)
+            a2, b2 = fma(w2, u, a2), fma(w2, v, b2)
+            a3, b3 = fma(w3, u, a3), fma(w3, v, b3)
+            source += rows
+            at += stride
+        store(F, t0, a0)
+        store(F, t0 + 4, b0)
+        store(F, t1, a1)
+        store(F, t1 + 4, b1)
+        store(F, t2, a2)
+        store(F, t2 + 4, b2)
+        store(F, t3, a3)
+        store(F, t3 + 4, b3)
+        q += 8
+
+
+@njit(cache=True, error_model="numpy")
+def multiply_settled(F, N, J, M, folded, weights, gathered, settled, work, stride, col_row):
+    """Add to every kept column what the rows read of it through the settled ones, four columns of a level at a time."""
+    rows, cols = N[folded + SYS_ROWS], N[folded + SYS_COLS]
+    new_col_row = folded + SYS_HEADER + N[folded + SYS_LEVELS] + 1 + 2 * rows + 1
+    col_begin = new_col_row + cols
+    first, k = 0, 0
+    while k < cols:
+        # Settled units of this column's level or before do not read it.
+        row = J[KEPT_ROWS * M + N[new_col_row + k]]
+        while first < settled and N[col_row + J[STABLE_COLS * M + first]] <= row:
+            first += 1
+        begin = N[col_begin + k]
+        if k + 4 <= cols and N[col_begin + k + 3] == begin:
+            accumulate_four(F, weights + k * rows, begin, rows, gathered, first, settled, work + k, stride)
+            k += 4
+        else:
+            accumulate(F, weights + k * rows, begin, rows, rows, gathered, first, settled, work + k, stride)
+            k += 1
+
+
+@njit(cache=True, error_model="numpy")
+def fold(F, N, X, J, M, system, floats, folded, folded_floats, least):
     """Write the folded system at ``folded`` (N) and ``folded_floats`` (F); scratch follows it in F.
 
-    Needs the states in J and the relaxations in X of `bound_units`. `folding_floats` tells how much of F is used.
+    ``least`` is UNSTABLE to substitute all settled rows, LINEAR to leave out the dead ones only. Needs the kinds of
+    `classify_rows` and the relaxations of `bound_units`. `folding_floats` tells how much of F is used.
     """
     rows, cols = N[system + SYS_ROWS], N[system + SYS_COLS]
     row_col = system + SYS_HEADER + N[system + SYS_LEVELS] + 1 + rows
     col_begin = row_col + rows + 1 + cols
-    col_end = col_begin + cols
-    new_rows, new_cols = lay_out_folded(N, J, M, system, folded)
-    settled = list_settled_columns(F, N, X, J, M, system, floats)
+    new_rows, new_cols = lay_out_folded(N, J, M, system, folded, least)
+    settled = list_settled_columns(N, X, J, M, system, least)
     new_row_col = folded + SYS_HEADER + N[folded + SYS_LEVELS] + 1 + new_rows
     new_col_row = new_row_col + new_rows + 1
     stride = padded(new_cols) + 4
     affine = padded(new_cols)
     work = folded_floats + N[folded + SYS_FLOATS]
     gathered = work + settled * stride
-    express_settled_rows(F, N, X, J, M, system, floats, settled, new_cols, folded, work, stride)
+    express_settled_rows(F, N, X, J, M, system, floats, settled, new_cols, folded, work, stride, gathered)
     weights = floats + 4 * rows
     begin = 0
     for p in range(settled):
@@ -258,22 +311,18 @@ def fold(F, N, X, J, M, system, floats, folded, folded_floats):
     for axis in range(4):
         target = folded_floats + axis * new_rows
         gather_column(F, J, M, floats + axis * rows, 0, new_rows, target)
-        accumulate(F, target, 0, new_rows, gathered, 0, settled, work + affine + axis, stride)
+    accumulate_four(F, folded_floats, 0, new_rows, gathered, 0, settled, work + affine, stride)
     new_weights = folded_floats + 4 * new_rows
     new_out = new_weights + new_cols * new_rows
     out_weights = weights + cols * rows
     new_col_begin = new_col_row + new_cols
     col_row = row_col + rows + 1
-    first = 0
     for k in range(new_cols):
         q = N[new_col_row + k]
         old = N[row_col + J[KEPT_ROWS * M + q]] + k - N[new_row_col + q]
-        while first < settled and N[col_row + J[STABLE_COLS * M + first]] <= N[col_row + old]:
-            first += 1
-        target = new_weights + k * new_rows
-        gather_column(F, J, M, weights + old * rows, N[new_col_begin + k], new_rows, target)
-        accumulate(F, target, N[new_col_begin + k], new_rows, gathered, first, settled, work + k, stride)
+        gather_column(F, J, M, weights + old * rows, N[new_col_begin + k], new_rows, new_weights + k * new_rows)
         F[new_out + k] = F[out_weights + old]
+    multiply_settled(F, N, J, M, folded, new_weights, gathered, settled, work, stride, col_row)
     out, new_constant = out_weights + padded(cols), new_out + padded(new_cols)
     for axis in range(4):
         F[new_constant + axis] = F[out + axis]
@@ -287,14 +336,14 @@ def fold(F, N, X, J, M, system, floats, folded, folded_floats):
 
 
 @njit(cache=True, error_model="numpy")
-def carry_states(N, J, M, tables, system, folded):
-    """After `fold`: move the state ranges in J to the rows of the folded system and hash the settled states into it."""
+def carry_states(N, J, M, tables, system, folded, least):
+    """After `fold`: move the state ranges in J to the rows of the folded system, hash the others' states into it."""
     rows = N[system + SYS_ROWS]
     row_unit = system + SYS_HEADER + N[system + SYS_LEVELS] + 1
     hash0, hash1 = N[system + SYS_HASH], N[system + SYS_HASH + 1]
     for r in range(rows):
         unit = N[row_unit + r]
-        if unit >= 0 and J[STATE_LOW * M + r] == J[STATE_HIGH * M + r]:
+        if unit >= 0 and J[KIND * M + r] < least:
             state = tables.first_knot[unit] + unit + J[STATE_LOW * M + r]
             hash0 ^= tables.state_hash[2 * state]
             hash1 ^= tables.state_hash[2 * state + 1]
@@ -308,4 +357,4 @@ def carry_states(N, J, M, tables, system, folded):
 @njit(cache=True, error_model="numpy")
 def folding_floats(rows, cols):
     """Upper bound of what `fold` writes to F for a system of this size."""
-    return system_floats(rows, cols) + cols * (padded(cols) + 4) + cols * rows
+    return system_floats(rows, cols) + cols * (padded(cols) + 4) + cols * max(rows, cols)

@@ -1,8 +1,8 @@
 """Four float64 values in one vector register, for compiled kernels.
 
-LLVM's loop vectoriser guards every short loop over arrays with run-time alias checks, which cost more than loops of four
-to thirty steps gain. Here the vector operations are written out, so that a kernel's inner loop is exactly its loads and
-fused multiply-adds. Every machine LLVM knows can run them; one without 256-bit registers splits them.
+LLVM's loop vectoriser guards every short loop over arrays with run-time alias checks, which cost more than loops of
+four to thirty steps gain. Here the vector operations are written out, so that a kernel's inner loop is exactly its
+loads and fused multiply-adds. Every machine LLVM knows can run them; one without 256-bit registers splits them.
 
 `load` and `store` are unaligned and unchecked: callers pad to a multiple of `WIDTH`.
 """

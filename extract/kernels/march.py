@@ -13,7 +13,7 @@ from typing import NamedTuple
 from numba import njit
 
 from mn_onnx.extract.kernels.bound import MARGIN, bound_output, bound_units, value_range
-from mn_onnx.extract.kernels.fold import carry_states, fold, folding_floats
+from mn_onnx.extract.kernels.fold import DEAD, LINEAR, UNSTABLE, carry_states, classify_rows, fold, folding_floats
 from mn_onnx.extract.kernels.lanes import cycles, pointer
 from mn_onnx.extract.kernels.leaf import emit_leaf
 from mn_onnx.extract.kernels.memory import (
@@ -233,6 +233,22 @@ def split_cell(
 
 
 @njit(cache=True, error_model="numpy")
+def how_to_fold(N, X, J, M, system):
+    """UNSTABLE to fold all settled rows of the system, LINEAR to leave out the dead ones, DEAD to keep it as it is.
+
+    Substitution costs the cube of the number of units, bounding its square, and leaving out dead rows keeps the zeros
+    between layers that are not neighbours: so the more units there are, the longer substitution is put off.
+    """
+    linear, dead = classify_rows(N, X, J, M, system)
+    units = N[system + SYS_UNITS]
+    if units < 64:
+        return UNSTABLE if 3 * (linear + dead) >= units else DEAD
+    if 7 * linear >= units:
+        return UNSTABLE
+    return LINEAR if 7 * dead >= units else DEAD
+
+
+@njit(cache=True, error_model="numpy")
 def visit(F, N, X, J, M, control, stack, output, tables, slot_of_tag, cell):
     """Process one cell that has been taken off the stack."""
     floats, system = N[cell + CELL_SYSTEM_F], N[cell + CELL_SYSTEM_I]
@@ -241,7 +257,7 @@ def visit(F, N, X, J, M, control, stack, output, tables, slot_of_tag, cell):
     for r in range(rows):
         J[STATE_LOW * M + r] = N[states + r]
         J[STATE_HIGH * M + r] = N[states + rows + r]
-    unstable = bound_units(F, N, X, J, M, tables, cell, system, floats)
+    bound_units(F, N, X, J, M, tables, cell, system, floats)
     radius = bound_output(F, N, X, M, system, floats)
     at = CENTRE_AT * M
     evaluate_affine(F, N, X, M, cell, OUT_VALUES, X[at], X[at + 1], X[at + 2], X[at + 3])
@@ -257,12 +273,14 @@ def visit(F, N, X, J, M, control, stack, output, tables, slot_of_tag, cell):
     row, knot = -1, 0
     if not leaf:
         row, knot = choose_split(N, X, J, M, tables, system)
+    else:
+        classify_rows(N, X, J, M, system)
     form = row
-    settled = N[system + SYS_UNITS] - unstable
-    if leaf or 4 * settled >= N[system + SYS_UNITS]:
+    least = UNSTABLE if leaf else how_to_fold(N, X, J, M, system)
+    if least > DEAD:
         folded, folded_floats = control[TOP_I], control[TOP_F]
-        fold(F, N, X, J, M, system, floats, folded, folded_floats)
-        carry_states(N, J, M, tables, system, folded)
+        fold(F, N, X, J, M, system, floats, folded, folded_floats, least)
+        carry_states(N, J, M, tables, system, folded, least)
         control[TOP_F] = folded_floats + N[folded + SYS_FLOATS]
         control[TOP_I] = folded + N[folded + SYS_INTS]
         control[FOLDS] += 1

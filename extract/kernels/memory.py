@@ -3,8 +3,8 @@
 A worker owns two arenas, ``F`` (float64) and ``N`` (int64), which grow upwards like a stack, and two scratch arrays,
 ``X`` (float64) and ``J`` (int64), cut into regions of ``M`` entries. Three kinds of blocks lie in the arenas.
 
-*System*: the network restricted to a cell and all cells inside it. ``rows`` units, padded level by level to a multiple of
-the lane width, ``cols`` outputs of these units, and the hash of the states of all units folded away.
+*System*: the network restricted to a cell and all cells inside it. ``rows`` units, padded level by level to a multiple
+of the lane width, ``cols`` outputs of these units, and the hash of the states of all units folded away.
 
     N: the SYS_* header, level_start[levels + 1], row_unit[rows] (-1 where padded),
        row_col[rows + 1], col_row[cols], col_begin[cols], col_end[cols] (the rows a column has weights on)
@@ -39,8 +39,8 @@ X_REGIONS = 36
 # Scratch regions of J.
 (STATE_LOW, STATE_HIGH, NEW_INDEX, CUT_OUT, CUT_IN, CUT_NEXT, CUT_PREVIOUS, CUT_FROM) = (0, 1, 2, 3, 4, 5, 6, 7)
 (TAGS_A, TAGS_B, CUT_TO, KEPT_ROWS, STABLE_COLS, CHOICE, CHOICE_FIRST, CHOICE_LAST) = (8, 9, 10, 11, 12, 13, 14, 15)
-(READ_COLS, READ_AT) = (16, 17)
-J_REGIONS = 18
+(READ_COLS, READ_AT, KIND) = (16, 17, 18)
+J_REGIONS = 19
 
 
 @njit(cache=True, error_model="numpy")

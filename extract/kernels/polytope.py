@@ -175,9 +175,9 @@ def read_cut_polygon(X, J, M, count, polygon, tags):
 def clip_polygon(X, J, M, count, polygon, tags, result, result_tags, a0, a1, a2, a3, side, tag, gradient):
     """Keep the part of a convex polygon where a . x + a3 is negative (side 0) or not (side 1).
 
-    A corner exactly on the plane goes to the side where f (``X[gradient : gradient + 3]``) falls: the piece on the other
-    side has no point with f < 0 there. The new edge gets ``tag``. Returns the number of corners of the result, 0 where
-    nothing is left.
+    A corner exactly on the plane goes to the side where f (``X[gradient : gradient + 3]``) falls: the piece on the
+    other side has no point with f < 0 there. The new edge gets ``tag``. Returns the number of corners of the result,
+    0 where nothing is left.
     """
     rises = a0 * X[gradient] + a1 * X[gradient + 1] + a2 * X[gradient + 2] > 0.0
     px, py, pz = polygon * M, (polygon + 1) * M, (polygon + 2) * M

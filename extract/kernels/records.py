@@ -16,8 +16,8 @@ class Tables(NamedTuple):
 
     Knots of all units lie one after the other; unit ``u`` owns ``first_knot[u]:first_knot[u + 1]`` (int64 [units + 1]).
     Output ``k`` of unit ``u`` has its pieces at ``first_piece[u] + k * (knots of u + 1)``. The plane of a knot has the
-    knot's index; box face ``f`` is plane ``n_knots + f``. ``state_hash`` (int64 [n_knots + units, 2]) has a word pair per
-    unit and state, ``tag_hash`` (int64 [2 * n_knots + 12, 2]) what turns the hash of a cell's states into that of a
+    knot's index; box face ``f`` is plane ``n_knots + f``. ``state_hash`` (int64 [n_knots + units, 2]) has a word pair
+    per unit and state, ``tag_hash`` (int64 [2 * n_knots + 12, 2]) what turns the hash of a cell's states into that of a
     vertex on the tagged plane. ``extent`` bounds the coordinates' magnitude on the box (at least 1).
     """
 
