@@ -25,8 +25,8 @@ Floats = NDArray[np.float64]
 PERTURBATION_SIZES = (1e-9, 1e-10, 1e-11, 1e-8)
 """Tried in this order: above the rounding of the traversal's bounds (about 1e-12), below the features of a network."""
 
-COINCIDENCE = 1e-11
-"""Vertices closer than this, relative to the box, are one point: above rounding, below a perturbation's size."""
+COINCIDENCE = 1e-12
+"""Vertices closer than this, relative to the box, may be one point: above rounding, below a perturbation's size."""
 
 
 @dataclass(frozen=True)
@@ -113,10 +113,12 @@ def extract_surface(
     with run.phase("traverse"):
         soup, statistics = traverse(network, run.lower, run.upper, threads=threads, progress=progress)
     with run.phase("weld"):
-        surface, found = _welded(soup, threads)
+        surface, found = _welded(soup, run)
         if not found:
             surface, degeneracy = _cleaned(surface, run, 0.0, Degeneracy())
-            found = _troubles(surface)
+            found = _torn(surface)
+            if narrow := _narrow(surface, run.coincidence):
+                found += (f"{narrow} polygons that may have no width but for rounding",)
     if not found:
         return Extraction(surface, statistics, degeneracy, run.seconds)
     best, best_degeneracy = surface, Degeneracy(found)
@@ -128,7 +130,7 @@ def extract_surface(
             surface, displacement = candidate
             degeneracy = Degeneracy(found, perturbation=size, displacement=displacement, attempts=attempt + 1)
             surface, degeneracy = _cleaned(surface, run, run.coincidence, degeneracy)
-            if not _troubles(surface):
+            if not _torn(surface):
                 return Extraction(surface, statistics, degeneracy, run.seconds)
             if surface.unmatched.size < best.unmatched.size:
                 best, best_degeneracy = surface, degeneracy
@@ -136,11 +138,11 @@ def extract_surface(
     return Extraction(best, statistics, best_degeneracy, run.seconds)
 
 
-def _welded(soup: PolygonSoup, threads: int | None) -> tuple[Surface, tuple[str, ...]]:
+def _welded(soup: PolygonSoup, run: _Run) -> tuple[Surface, tuple[str, ...]]:
     """The surface of ``soup``, and what in it only rounding can have caused."""
     soup, n_dropped = _whole_polygons(soup)
-    surface = weld(soup, threads=threads)
-    found = _troubles(surface)
+    surface = weld(soup, threads=run.threads)
+    found = _torn(surface)
     if n_dropped:
         found = (f"{n_dropped} polygons with fewer than 3 corners", *found)
     return surface, found
@@ -164,8 +166,8 @@ def _whole_polygons(soup: PolygonSoup) -> tuple[PolygonSoup, int]:
     return kept, int(np.count_nonzero(~whole))
 
 
-def _troubles(surface: Surface) -> tuple[str, ...]:
-    """What an arrangement in general position never shows, a sentence each."""
+def _torn(surface: Surface) -> tuple[str, ...]:
+    """What tells that signs were decided differently in different cells, a sentence each."""
     counts = (
         (surface.unmatched.size, "edges inside the box without neighbour"),
         (int(surface.report["position_disagreements"]), "corners apart from their vertex"),
@@ -173,10 +175,15 @@ def _troubles(surface: Surface) -> tuple[str, ...]:
     return tuple(f"{count} {what}" for count, what in counts if count)
 
 
+def _narrow(surface: Surface, length: float) -> int:
+    """The number of polygons that have an edge of at most ``length`` or are no wider than that."""
+    measures = surface.measures
+    return int(np.count_nonzero((measures.shortest_edges <= length) | (measures.areas <= length * measures.perimeters)))
+
+
 def _cleaned(surface: Surface, run: _Run, length: float, degeneracy: Degeneracy) -> tuple[Surface, Degeneracy]:
     """The surface without edges of at most ``length``, polygons without area and copies of box faces."""
-    measures = surface.measures
-    if (measures.shortest_edges <= length).any() or (measures.areas <= length * measures.perimeters).any():
+    if _narrow(surface, length):
         surface, contraction = contract_short_edges(surface, length)
         degeneracy = replace(
             degeneracy,
