@@ -146,8 +146,12 @@ def _add_model(parser: argparse.ArgumentParser) -> None:
     )
     field.add_argument("--coordinates", metavar="I,J,K", help="columns or inputs that are the coordinates, in order")
     smooth = parser.add_argument_group("smooth activations")
-    smooth.add_argument("--surrogate-tol", type=float, metavar="T", help="error allowed per piecewise-linear surrogate")
-    smooth.add_argument("--knots-per-period", type=int, metavar="N", help="knots per period of sines and cosines")
+    smooth.add_argument(
+        "--surrogate-tol", type=float, metavar="T", help="refine surrogates until |f_true - f| is certified at most T"
+    )
+    smooth.add_argument(
+        "--knots-per-period", type=int, metavar="N", help="fineness of surrogates, where no tolerance is given"
+    )
 
 
 def _add_threads(parser: argparse.ArgumentParser) -> None:

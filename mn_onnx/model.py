@@ -14,10 +14,9 @@ from numpy.typing import ArrayLike, NDArray
 from mn_onnx.errors import ModelRefused, Problem, UsageError
 from mn_onnx.importer import Imported, import_network
 from mn_onnx.ir.bounds import output_bounds
-from mn_onnx.ir.certify import certified_error
 from mn_onnx.ir.evaluate import evaluate
 from mn_onnx.ir.network import Network
-from mn_onnx.ir.passes import Canonical, PassFailed, canonicalize
+from mn_onnx.ir.passes import Canonical, PassFailed, ToleranceNotReached, canonicalize
 from mn_onnx.options import DEFAULT_BOUNDS, bounds_from_metadata, box, output_and_channel
 from mn_onnx.reader import ModelSource, ReadModel, read_model
 
@@ -33,8 +32,8 @@ class LoadOptions(TypedDict, total=False):
     metadata, else [-1, 1] on every axis.
     ``bind``: values for the other inputs, by name: numbers or arrays of the input's shape.
     ``coordinates``: which columns of the input are the point, if it has more.
-    ``surrogate_tol``: error allowed for the piecewise-linear surrogate of each smooth activation.
-    ``knots_per_period``: knots per period of sines and cosines.
+    ``surrogate_tol``: refine the surrogates of smooth activations until |f_true - f| is certified to be at most this.
+    ``knots_per_period``: how finely surrogates follow smooth activations, if no tolerance is given.
     """
 
     output: str | None
@@ -78,10 +77,10 @@ class Model:
         """Whether the network is piecewise linear as it stands, so that no surrogate stands in for an activation."""
         return self.canonical.is_exact
 
-    @cached_property
+    @property
     def surrogate_eps(self) -> float:
         """A proved bound on |f_true - f| in the box, of the canonical f; zero for exact networks."""
-        return certified_error(self.network, self.lower, self.upper)
+        return self.canonical.surrogate_eps
 
     @cached_property
     def output_range(self) -> tuple[float, float]:
@@ -137,10 +136,13 @@ def load(source: ModelSource, **options: Unpack[LoadOptions]) -> Model:
             lower=lower,
             upper=upper,
             level=level,
+            surrogate_tol=tolerance,
             knots_per_period=knots,
         )
     except PassFailed as error:
         remedy = "choose smaller --bounds, or export the network with activations that are defined everywhere"
         raise ModelRefused([Problem("", "", 0, str(error), remedy)]) from error
+    except ToleranceNotReached as error:
+        raise UsageError(f"--surrogate-tol {tolerance:g} cannot be certified: {error}") from error
     seconds = {"import": read_in - started, "lower": time.perf_counter() - read_in}
     return Model(read, imported, canonical, level, lower, upper, seconds)

@@ -8,33 +8,13 @@ import tomllib
 from pathlib import Path
 
 import numpy as np
-import onnx
 import pytest
-from onnx import TensorProto, helper, numpy_helper
+from small_models import octahedron_model, octahedron_volume
 
 import mn_onnx
 from mn_onnx.progress import ProgressEvent
 
 ROOT = Path(__file__).resolve().parent.parent
-
-
-def box_model(half: float = 0.5, *, name: str = "box") -> onnx.ModelProto:
-    """max(|x|, |y|, |z|) - half: a cube, whose unit for y - 0.001 x keeps the planes in general position."""
-    tilt = np.array([[1.0, 0.013, 0.007], [-0.011, 1.0, 0.017], [0.003, -0.019, 1.0]], np.float32)
-    nodes = [
-        helper.make_node("MatMul", ["x", "tilt"], ["t"], name="tilt"),
-        helper.make_node("Abs", ["t"], ["a"], name="abs"),
-        helper.make_node("ReduceMax", ["a"], ["m"], name="max", axes=[1], keepdims=1),
-        helper.make_node("Sub", ["m", "half"], ["y"], name="sub"),
-    ]
-    graph = helper.make_graph(
-        nodes,
-        name,
-        [helper.make_tensor_value_info("x", TensorProto.FLOAT, ["N", 3])],
-        [helper.make_tensor_value_info("y", TensorProto.FLOAT, ["N", 1])],
-        [numpy_helper.from_array(tilt, "tilt"), numpy_helper.from_array(np.array([half], np.float32), "half")],
-    )
-    return helper.make_model(graph, opset_imports=[helper.make_opsetid("", 13)], ir_version=8)
 
 
 def test_every_public_name_is_there() -> None:
@@ -62,15 +42,15 @@ def test_extract_is_function_and_package() -> None:
     assert result.stdout.split() == ["True", "True", "mn_onnx.extract.weld"]
 
 
-def test_extracts_a_cube_with_a_full_report() -> None:
+def test_extracts_an_octahedron_with_a_full_report() -> None:
     phases: list[str] = []
 
     def listen(event: ProgressEvent) -> None:
         phases.append(event.phase)
 
-    surface = mn_onnx.extract(box_model(), bounds=(-1, 1), progress=listen)
+    surface = mn_onnx.extract(octahedron_model(), bounds=(-1, 1), progress=listen)
     report = surface.report
-    assert surface.volume == pytest.approx(1.0, rel=2e-3)
+    assert surface.volume == pytest.approx(octahedron_volume(), rel=1e-7)
     assert report["euler"] == 2
     assert report["components"] == 1
     assert report["closed"]
@@ -90,13 +70,13 @@ def test_extracts_a_cube_with_a_full_report() -> None:
 
 
 def test_loading_apart_from_extracting() -> None:
-    model = mn_onnx.load(box_model(), bounds=[(-1, 1), (-1, 1), (-1, 0)])
+    model = mn_onnx.load(octahedron_model(), bounds=[(-1, 1), (-1, 1), (-1, 0)])
     assert model.dimension == 3
     assert model.exact
     np.testing.assert_array_equal(model.upper, [1, 1, 0])
-    np.testing.assert_allclose(model.evaluate(np.zeros((1, 3))), [-0.5])
+    np.testing.assert_allclose(model.evaluate(np.zeros((1, 3))), [-0.5 / 3])
     low, high = model.output_range
-    assert low <= -0.5 < 0.4 < high
+    assert low <= -0.5 / 3 < 0.4 < high
     surface = mn_onnx.extract(model, threads=1)
     assert surface.report["boundary_edges"] > 0
     assert surface.report["closed"]
@@ -105,11 +85,11 @@ def test_loading_apart_from_extracting() -> None:
 
 
 def test_an_empty_level_set_is_told_with_range_and_nearest_level() -> None:
-    surface = mn_onnx.extract(box_model(), level=-0.75)
+    surface = mn_onnx.extract(octahedron_model(), level=-0.25)
     assert surface.n_polygons == 0
     (note,) = surface.report["notes"]
     assert "empty" in note
-    assert "-0.5" in note
+    assert "-0.16" in note
 
 
 @pytest.mark.parametrize(
@@ -129,7 +109,7 @@ def test_an_empty_level_set_is_told_with_range_and_nearest_level() -> None:
 )
 def test_wrong_options_are_usage_errors(options: dict[str, object], words: str) -> None:
     with pytest.raises(mn_onnx.UsageError, match=words):
-        mn_onnx.extract(box_model(), **options)
+        mn_onnx.extract(octahedron_model(), **options)
 
 
 def test_a_network_that_was_read_wrongly_fails_the_check(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -138,7 +118,7 @@ def test_a_network_that_was_read_wrongly_fails_the_check(monkeypatch: pytest.Mon
     true = Model.evaluate
     monkeypatch.setattr(Model, "evaluate", lambda self, points: true(self, points) * (1 + 1e-4))
     with pytest.raises(mn_onnx.CheckFailed, match="times what rounding explains"):
-        mn_onnx.extract(box_model())
+        mn_onnx.extract(octahedron_model())
 
 
 def test_versions_agree() -> None:
