@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -173,22 +173,25 @@ def _only_point_input(
 
 
 def coordinate_axis(entry: GraphInput, *, wide: bool = False) -> int | None:
-    """The axis of the columns: the last one of 2 or 3 columns, else one of 3, 2 or 1; any number if ``wide``.
+    """The axis of the columns: the last one of 2 or 3 columns, else one of 3, 2, more, or 1, looked for in this order.
 
-    None if there is none, and the input holds one number per point.
+    ``wide``: columns were named, so that a last axis of more columns comes first. None if there is no such axis, and
+    the input holds one number per point.
     """
     sizes = {axis: size for axis, size in enumerate(entry.shape) if size is not None}
-    last = len(entry.shape) - 1
-    if sizes.get(last) in (2, 3) or (wide and sizes.get(last, 0) > MAX_DIM):
-        return last
-    for wanted in (3, 2):
-        fitting = [axis for axis, size in sizes.items() if size == wanted]
-        if fitting and (len(sizes) == 1 or len(entry.shape) > 1):
-            return fitting[-1]
-    if wide and (many := [axis for axis, size in sizes.items() if size > MAX_DIM]):
-        return many[-1]
-    ones = [axis for axis, size in sizes.items() if size == 1]
-    return ones[-1] if ones else None
+    last = sizes.get(len(entry.shape) - 1, 0)
+    if last in (2, 3) or (wide and last > MAX_DIM):
+        return len(entry.shape) - 1
+    fits: tuple[Callable[[int], bool], ...] = (
+        lambda size: size == 3,
+        lambda size: size == 2,
+        lambda size: size > MAX_DIM,
+        lambda size: size == 1,
+    )
+    for fit in fits:
+        if axes := [axis for axis, size in sizes.items() if fit(size)]:
+            return axes[-1]
+    return None
 
 
 def _bound_input(entry: GraphInput, value: np.ndarray) -> BoundInput:
@@ -235,7 +238,7 @@ def _arrange(
             problems.append(_integer_input(entry))
             continue
         special = columns.get(entry.name, _Columns())
-        axis = coordinate_axis(entry, wide=True)
+        axis = coordinate_axis(entry, wide=entry.name in columns)
         width = 1 if axis is None else entry.shape[axis] or 0
         bound = dict(special.bound)
         if entry.name in values:

@@ -82,9 +82,14 @@ class Composer:
                 base[members] = CONSTANT
                 offset[members] = evaluate(expression, np.zeros(()))
             else:
-                function[members] = self.store.function(expression, self.node)
+                function[members] = self.store.function(expression, self._to_blame(operands, position))
                 scale[members] = 1.0
         return Tensor(np.full(n, NO_POINT, np.int32), base, function, scale, offset, operands[0].dtype)
+
+    def _to_blame(self, operands: Sequence[Tensor], i: int) -> str:
+        """The node that would make a composition jump: the one that made a part jump, else the present one."""
+        parts = [self.store.step_nodes[operand.function[i]] for operand in operands if operand.live[i]]
+        return next(filter(None, parts), self.node)
 
     def _expression(self, operand: Tensor, i: int, relation: tuple[np.ndarray, np.ndarray]) -> Expression:
         if not operand.live[i]:

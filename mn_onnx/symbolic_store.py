@@ -65,7 +65,7 @@ class Store:
     # Functions
 
     def function(self, expression: Expression, node: str) -> int:
-        """The number of a function; ``node`` is to blame if it is a step and none of its parts was one before."""
+        """The number of a function; ``node`` is to blame if it jumps."""
         known = self._function_ids.get(expression)
         if known is not None:
             return known

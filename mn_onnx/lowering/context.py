@@ -21,8 +21,8 @@ from mn_onnx.symbolic_store import Store
 GraphValue = Constant | Tensor | Opaque | list[Any]
 Scope = dict[str, GraphValue]
 
-STEP_LIMIT = 100_000
-"""Most nodes that are run, counting every iteration of loops."""
+STEP_LIMIT = 20_000
+"""Most nodes of subgraphs that are run, counting every iteration of loops."""
 
 
 class Context:
@@ -48,7 +48,6 @@ class Context:
         self._numbers: dict[tuple[str, str], int] = {}
         self._ops: dict[str, tuple[str, int]] = {}
         self._steps = 0
-        self._depth = 0
         self._scopes: list[Scope] = []
 
     # Problems
@@ -80,23 +79,37 @@ class Context:
         scope.update({tensor.name: read_tensor(tensor) for tensor in graph.initializer})
         scope.update(inputs)
         self._scopes.append(scope)
-        self._depth += 1
+        try:
+            self._run_nodes(graph, scope)
+        finally:
+            self._scopes.pop()
+        return [self._read(scope, output.name) for output in graph.output]
+
+    def _run_nodes(self, graph: onnx.GraphProto, scope: Scope) -> None:
+        """Run the nodes of a graph, dropping tensors after their last use."""
         pending = Counter(name for node in graph.node for name in reads(node))
         pending.update(output.name for output in graph.output)
         for proto in graph.node:
             label = node_label(proto)
+            if len(self._scopes) > 1:
+                self._count_step()
             for name, value in zip(proto.output, self._run_node(proto, scope, label), strict=False):
                 if name:
                     scope[name] = value
-            if self._depth == 1:
+            if len(self._scopes) == 1:
                 self.traces.append(Trace.of(label, [scope[name] for name in proto.output if name in scope], self.store))
             for name in reads(proto):
                 pending[name] -= 1
                 if not pending[name]:
                     scope.pop(name, None)
-        self._depth -= 1
-        self._scopes.pop()
-        return [self._read(scope, output.name) for output in graph.output]
+
+    def _count_step(self) -> None:
+        self._steps += 1
+        if self._steps > STEP_LIMIT:
+            raise UnsupportedNode(
+                f"it runs more than {STEP_LIMIT} nodes, counting loop iterations",
+                "export with fewer iterations, or without a loop over the points",
+            )
 
     def _read(self, scope: Scope, name: str) -> GraphValue:
         value = scope.get(name)
@@ -108,7 +121,6 @@ class Context:
         )
 
     def _run_node(self, proto: onnx.NodeProto, scope: Scope, label: str) -> Sequence[GraphValue]:
-        self._steps += 1
         domain = "" if proto.domain == "ai.onnx" else proto.domain
         inputs = [self._read(scope, name) if name else None for name in proto.input]
         while inputs and inputs[-1] is None:
@@ -117,11 +129,9 @@ class Context:
         self._ops[label] = (f"{domain}::{proto.op_type}" if domain else proto.op_type, node.version)
         self.algebra.node = label
         try:
-            if self._steps > STEP_LIMIT:
-                raise UnsupportedNode(f"the model runs more than {STEP_LIMIT} nodes, counting loop iterations")
             outputs = self._lower(node)
-        except OpaqueInput:
-            return self._opaque(node, frozenset())
+        except OpaqueInput as error:
+            return self._opaque(node, error.problems)
         except UnsupportedNode as error:
             return self._opaque(node, frozenset({self.report(node, error.reason, error.remedy)}))
         except TooLargeError as error:

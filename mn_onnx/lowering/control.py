@@ -36,7 +36,7 @@ def loop(context: Context, node: Node) -> tuple[GraphValue, ...]:
         condition = Constant(np.asarray(True), np.dtype(bool))
         outputs = context.run_graph(body, dict(zip(names, [counter, condition, *state], strict=True)))
         if isinstance(outputs[0], Opaque):
-            raise OpaqueInput
+            raise OpaqueInput(outputs[0].problems)
         if not isinstance(outputs[0], Constant):
             raise UnsupportedNode("whether it goes on depends on the points", "export with a constant trip count")
         proceed = bool(np.ravel(outputs[0].array)[0])
@@ -104,7 +104,7 @@ def _stacked(values: list[GraphValue], axis: int) -> GraphValue:
 def _sequence(node: Node) -> list[GraphValue]:
     value = node.inputs[0]
     if isinstance(value, Opaque):
-        raise OpaqueInput
+        raise OpaqueInput(value.problems)
     if not isinstance(value, list):
         raise UnsupportedNode("its first input is not a sequence")
     return value

@@ -97,21 +97,23 @@ def _scatter(context: Context, node: Node, x: Movable, flat: Indices, updates: M
     if flat.shape != updates.shape:
         raise UnsupportedNode(f"updates of shape {list(updates.shape)} do not fit indices for {list(flat.shape)}")
     reduction = node.attribute("reduction", "none")
-    both = lift(concatenate([rearrange(x, np.ravel), rearrange(updates, np.ravel)], 0))
-    n = math.prod(x.shape)
-    chosen = np.arange(n)
-    if reduction == "none":
-        chosen[flat.reshape(-1)] = n + np.arange(flat.size)
-    else:
-        if reduction not in COMBINE:
-            raise UnsupportedNode(f"reduction {reduction!r} is not defined")
-        if np.unique(flat).size != flat.size:
-            raise UnsupportedNode("it joins several updates at one place")
-        old, new = lift(rearrange(x, np.ravel)).take(flat.reshape(-1)), lift(rearrange(updates, np.ravel))
-        joined = COMBINE[reduction](context.algebra, old, new)
-        both = lift(concatenate([lift(rearrange(x, np.ravel)), joined], 0))
-        chosen[flat.reshape(-1)] = n + np.arange(flat.size)
-    return lower(both.take(chosen.reshape(x.shape)).with_dtype(x.dtype))
+    if reduction != "none" and reduction not in COMBINE:
+        raise UnsupportedNode(f"reduction {reduction!r} is not defined")
+    result, new = lift(rearrange(x, np.ravel)), lift(rearrange(updates, np.ravel))
+    places = flat.reshape(-1)
+    waiting = np.arange(places.size)
+    while waiting.size:
+        # Several updates of one place are joined one after the other.
+        _, first = np.unique(places[waiting], return_index=True)
+        now = waiting[first]
+        value = new[now]
+        if reduction != "none":
+            value = COMBINE[reduction](context.algebra, result[places[now]], value)
+        chosen = np.arange(result.size)
+        chosen[places[now]] = result.size + np.arange(now.size)
+        result = lift(concatenate([result, value], 0)).take(chosen)
+        waiting = np.delete(waiting, first)
+    return lower(result.reshape(*x.shape).with_dtype(x.dtype))
 
 
 def compress(_context: Context, node: Node) -> Movable:

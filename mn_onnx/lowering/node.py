@@ -23,7 +23,11 @@ class UnsupportedNode(Exception):
 
 
 class OpaqueInput(Exception):
-    """A node reads a tensor that a refused node should have made."""
+    """A node reads a tensor that a refused node should have made; ``problems`` are the numbers of the reasons."""
+
+    def __init__(self, problems: frozenset[int]) -> None:
+        super().__init__()
+        self.problems = problems
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,7 +66,7 @@ class Node:
             raise UnsupportedNode(f"input {index} is missing")
         value = self.inputs[index]
         if isinstance(value, Opaque):
-            raise OpaqueInput
+            raise OpaqueInput(value.problems)
         if not isinstance(value, (Constant, Tensor)):
             raise UnsupportedNode(f"input {index} is a sequence, not a tensor")
         return value
