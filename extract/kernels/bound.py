@@ -59,12 +59,10 @@ def row_extremes(F, N, X, M, cell, begin, end):
 
 @njit(cache=True, error_model="numpy")
 def relax_piece_range(knots, slopes, intercepts, knot, piece, first, last, low, high):
-    """Relax a table's pieces ``first..last`` by their chord over [low, high].
+    """Relax a table's pieces ``first..last``, more than one, by their chord over [low, high].
 
     Returns slope, offset and error with ``|y - slope t - offset| <= error``.
     """
-    if first == last:
-        return slopes[piece + first], intercepts[piece + first], 0.0
     at_low = slopes[piece + first] * low + intercepts[piece + first]
     at_high = slopes[piece + last] * high + intercepts[piece + last]
     slope = (at_high - at_low) / (high - low)
@@ -84,39 +82,43 @@ def settle_row(N, X, J, M, tables, cols, r, unit):
     Sets STATE_LOW, STATE_HIGH of the row and SLOPE, OFFSET, ERROR of its columns.
     """
     knot, knots = tables.first_knot[unit], tables.knots
+    pieces = tables.first_knot[unit + 1] - knot + 1
     first, last = J[STATE_LOW * M + r], J[STATE_HIGH * M + r]
-    radius = X[RADIUS * M + r]
     low, high = X[LOW * M + r], X[HIGH * M + r]
-    margin = 0.0
-    if radius > 0.0:
-        low -= radius
-        high += radius
-        size = abs(X[r]) + abs(X[M + r]) + abs(X[2 * M + r]) + abs(X[3 * M + r]) + radius
-        margin = MARGIN * size * tables.extent
-    while first < last and low - margin >= knots[knot + first]:
-        first += 1
-    while last > first and high + margin < knots[knot + last - 1]:
-        last -= 1
     if first < last:
+        radius = X[RADIUS * M + r]
+        margin = 0.0
+        if radius > 0.0:
+            low -= radius
+            high += radius
+            size = abs(X[r]) + abs(X[M + r]) + abs(X[2 * M + r]) + abs(X[3 * M + r]) + radius
+            margin = MARGIN * size * tables.extent
+        while first < last and low - margin >= knots[knot + first]:
+            first += 1
+        while last > first and high + margin < knots[knot + last - 1]:
+            last -= 1
         # A cell that was split here lies on one side of the knot, whatever the radius says.
         if first > 0 and low < knots[knot + first - 1] < high:
             low = knots[knot + first - 1]
-        if last < tables.first_knot[unit + 1] - knot and low < knots[knot + last] < high:
+        if last < pieces - 1 and low < knots[knot + last] < high:
             high = knots[knot + last]
-    J[STATE_LOW * M + r] = first
-    J[STATE_HIGH * M + r] = last
-    X[LOW * M + r] = low
-    X[HIGH * M + r] = high
-    begin, end = N[cols + r], N[cols + r + 1]
-    pieces = tables.first_knot[unit + 1] - knot + 1
+        J[STATE_LOW * M + r] = first
+        J[STATE_HIGH * M + r] = last
+        X[LOW * M + r] = low
+        X[HIGH * M + r] = high
     piece = tables.first_piece[unit]
-    for c in range(begin, end):
-        slope, offset, error = relax_piece_range(
-            knots, tables.slopes, tables.intercepts, knot, piece, first, last, low, high
-        )
-        X[SLOPE * M + c] = slope
-        X[OFFSET * M + c] = offset
-        X[ERROR * M + c] = error
+    for c in range(N[cols + r], N[cols + r + 1]):
+        if first == last:
+            X[SLOPE * M + c] = tables.slopes[piece + first]
+            X[OFFSET * M + c] = tables.intercepts[piece + first]
+            X[ERROR * M + c] = 0.0
+        else:
+            slope, offset, error = relax_piece_range(
+                knots, tables.slopes, tables.intercepts, knot, piece, first, last, low, high
+            )
+            X[SLOPE * M + c] = slope
+            X[OFFSET * M + c] = offset
+            X[ERROR * M + c] = error
         piece += pieces
 
 

@@ -17,6 +17,8 @@ from mn_onnx.extract.kernels.fold import DEAD, LINEAR, UNSTABLE, carry_states, c
 from mn_onnx.extract.kernels.lanes import cycles, pointer
 from mn_onnx.extract.kernels.leaf import emit_leaf
 from mn_onnx.extract.kernels.memory import (
+    ABOVE,
+    BELOW,
     CELL_CAPACITY,
     CELL_DEPTH,
     CELL_END_F,
@@ -27,12 +29,14 @@ from mn_onnx.extract.kernels.memory import (
     CELL_VERTICES,
     CENTRE_AT,
     CUT_FROM,
+    CUT_SHARE,
     CUT_TO,
     HIGH,
     LOW,
     NEW_INDEX,
     OUT_VALUES,
     RADIUS,
+    SIDE_COUNTS,
     STATE_HIGH,
     STATE_LOW,
     SYS_COLS,
@@ -168,27 +172,27 @@ def choose_split(N, X, J, M, tables, system):
 
 
 @njit(cache=True, error_model="numpy")
-def half_range(X, J, M, n, count, side):
+def half_range(X, J, M, count, side):
     """Range of the output's centre over the vertices of one half of a split cell."""
     low, high = 1e308, -1e308
-    t, out = VALUES * M, OUT_VALUES * M
-    for v in range(n):
-        if (X[t + v] >= 0.0) == (side == 1):
-            low, high = min(low, X[out + v]), max(high, X[out + v])
+    out = OUT_VALUES * M
+    members = (BELOW if side == 0 else ABOVE) * M
+    for w in range(J[SIDE_COUNTS * M + side]):
+        value = X[out + J[members + w]]
+        low, high = min(low, value), max(high, value)
     for j in range(count):
         v, u = J[CUT_FROM * M + j] // 3, J[CUT_TO * M + j] // 3
-        s = X[t + v] / (X[t + v] - X[t + u])
-        value = X[out + v] + s * (X[out + u] - X[out + v])
+        value = X[out + v] + X[CUT_SHARE * M + j] * (X[out + u] - X[out + v])
         low, high = min(low, value), max(high, value)
     return low, high
 
 
 @njit(cache=True, error_model="numpy")
 def push_half(F, N, X, J, M, control, stack, cell, cell_rows, system, floats, count, side, row, knot, tag):
-    """Push one half of the cell, split in X[VALUES], as a cell over ``system`` whose states are in J."""
+    """Push one half of the cell, cut as `find_cut_edges` found, as a cell over ``system`` whose states are in J."""
     rows = N[system + SYS_ROWS]
     half, half_floats = control[TOP_I], control[TOP_F]
-    total = write_half(F, N, X, J, M, cell, cell_rows, rows, VALUES, count, side, tag, half, half_floats)
+    total = write_half(F, N, X, J, M, cell, cell_rows, rows, count, side, tag, half, half_floats)
     N[half + CELL_SYSTEM_F], N[half + CELL_SYSTEM_I] = floats, system
     N[half + CELL_DEPTH] = N[cell + CELL_DEPTH] + 1
     states = half + CELL_HEADER
@@ -221,9 +225,8 @@ def split_cell(
     )
     count = find_cut_edges(F, N, X, J, M, cell, cell_rows, VALUES)
     link_cut_edges(J, M, slot_of_tag, count)
-    n = N[cell + CELL_VERTICES]
     for side in (1, 0):
-        low, high = half_range(X, J, M, n, count, side)
+        low, high = half_range(X, J, M, count, side)
         if low > slack or high < -slack:
             control[CHILDREN_PRUNED] += 1
             continue

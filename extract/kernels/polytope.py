@@ -12,6 +12,8 @@ from numba import njit
 
 from mn_onnx.extract.kernels.lanes import fma, load, splat, store
 from mn_onnx.extract.kernels.memory import (
+    ABOVE,
+    BELOW,
     CELL_CAPACITY,
     CELL_FLOATS,
     CELL_HEADER,
@@ -21,10 +23,12 @@ from mn_onnx.extract.kernels.memory import (
     CUT_NEXT,
     CUT_OUT,
     CUT_PREVIOUS,
+    CUT_SHARE,
     CUT_TO,
     CUT_X,
     NEW_INDEX,
     POLY_VALUES,
+    SIDE_COUNTS,
     padded,
 )
 
@@ -47,9 +51,10 @@ def evaluate_affine(F, N, X, M, cell, region, a0, a1, a2, a3):
 def find_cut_edges(F, N, X, J, M, cell, rows, values):
     """Collect the edges on which ``X[values]`` changes sign, from the negative to the positive end.
 
-    Fills CUT_FROM and CUT_TO (``3 * vertex + slot`` at either end), the corner's position CUT_X, CUT_Y, CUT_Z and the
-    tags CUT_IN, CUT_OUT along which the polygon of the cut comes in and leaves, seen from the positive side.
-    Returns the number of edges.
+    Fills CUT_FROM and CUT_TO (``3 * vertex + slot`` at either end), the corner's position CUT_X, CUT_Y, CUT_Z, how far
+    along the edge it lies, CUT_SHARE, and the tags CUT_IN, CUT_OUT along which the polygon of the cut comes in and
+    leaves, seen from the positive side. BELOW and ABOVE list the vertices of either sign, SIDE_COUNTS their numbers,
+    and NEW_INDEX gives a vertex's place in its list. Returns the number of edges.
     """
     n = N[cell + CELL_VERTICES]
     tags = cell + CELL_HEADER + 2 * rows
@@ -57,30 +62,40 @@ def find_cut_edges(F, N, X, J, M, cell, rows, values):
     x = N[cell + CELL_FLOATS]
     capacity = N[cell + CELL_CAPACITY]
     t = values * M
-    count = 0
+    # Signs are as good as random, so they move counters instead of choosing branches.
+    below, above = 0, 0
     for v in range(n):
-        tv = X[t + v]
-        if tv >= 0.0:
-            continue
+        negative = X[t + v] < 0.0
+        J[BELOW * M + below] = v
+        J[ABOVE * M + above] = v
+        J[NEW_INDEX * M + v] = below if negative else above
+        below += negative
+        above += not negative
+    J[SIDE_COUNTS * M] = below
+    J[SIDE_COUNTS * M + 1] = above
+    count = 0
+    for b in range(below):
+        v3 = 3 * J[BELOW * M + b]
         for i in range(3):
-            u = N[neighbours + 3 * v + i]
-            tu = X[t + u]
-            if tu < 0.0:
-                continue
-            j = 0
-            while N[neighbours + 3 * u + j] != v:
-                j += 1
-            k1 = i + 1 if i < 2 else 0
-            k2 = i - 1 if i > 0 else 2
-            s = tv / (tv - tu)
-            J[CUT_FROM * M + count] = 3 * v + i
-            J[CUT_TO * M + count] = 3 * u + j
-            J[CUT_OUT * M + count] = N[tags + 3 * v + k1]
-            J[CUT_IN * M + count] = N[tags + 3 * v + k2]
-            for axis in range(3):
-                at = x + axis * capacity
-                X[(CUT_X + axis) * M + count] = F[at + v] + s * (F[at + u] - F[at + v])
-            count += 1
+            J[CUT_FROM * M + count] = v3 + i
+            count += X[t + N[neighbours + v3 + i]] >= 0.0
+    for j in range(count):
+        end = J[CUT_FROM * M + j]
+        v = end // 3
+        i = end - 3 * v
+        u = N[neighbours + end]
+        back = (N[neighbours + 3 * u + 1] == v) + 2 * (N[neighbours + 3 * u + 2] == v)
+        k1 = i + 1 if i < 2 else 0
+        k2 = i - 1 if i > 0 else 2
+        tv = X[t + v]
+        s = tv / (tv - X[t + u])
+        J[CUT_TO * M + j] = 3 * u + back
+        J[CUT_OUT * M + j] = N[tags + 3 * v + k1]
+        J[CUT_IN * M + j] = N[tags + 3 * v + k2]
+        X[CUT_SHARE * M + j] = s
+        for axis in range(3):
+            at = x + axis * capacity
+            X[(CUT_X + axis) * M + j] = F[at + v] + s * (F[at + u] - F[at + v])
     return count
 
 
@@ -96,23 +111,20 @@ def link_cut_edges(J, M, slot_of_tag, count):
 
 
 @njit(cache=True, error_model="numpy")
-def write_half(F, N, X, J, M, cell, rows, half_rows, values, count, side, tag, half, half_floats):
-    """Write one half of a split cell's polytope; the caller fills the rest of the header and the states.
+def write_half(F, N, X, J, M, cell, rows, half_rows, count, side, tag, half, half_floats):
+    """Write one half of the polytope that `find_cut_edges` has looked at.
 
-    ``side`` 0 keeps the negative vertices, 1 the others. ``half`` and ``half_floats`` are its places in N and F.
-    ``rows`` and ``half_rows`` are the rows of the cell's and the half's systems. Returns the number of vertices.
+    The caller fills the rest of the header and the states. ``side`` 0 keeps the negative vertices, 1 the others.
+    ``half`` and ``half_floats`` are its places in N and F, ``rows`` and ``half_rows`` the rows of the cell's and the
+    half's systems. Returns the number of vertices.
     """
     n = N[cell + CELL_VERTICES]
     tags = cell + CELL_HEADER + 2 * rows
     neighbours = tags + 3 * n
     x = N[cell + CELL_FLOATS]
     capacity = N[cell + CELL_CAPACITY]
-    t = values * M
-    kept = 0
-    for v in range(n):
-        if (X[t + v] >= 0.0) == (side == 1):
-            J[NEW_INDEX * M + v] = kept
-            kept += 1
+    members = (BELOW if side == 0 else ABOVE) * M
+    kept = J[SIDE_COUNTS * M + side]
     total = kept + count
     new_capacity = padded(total)
     new_tags = half + CELL_HEADER + 2 * half_rows
@@ -120,10 +132,8 @@ def write_half(F, N, X, J, M, cell, rows, half_rows, values, count, side, tag, h
     N[half + CELL_VERTICES] = total
     N[half + CELL_CAPACITY] = new_capacity
     N[half + CELL_FLOATS] = half_floats
-    for v in range(n):
-        if (X[t + v] >= 0.0) != (side == 1):
-            continue
-        w = J[NEW_INDEX * M + v]
+    for w in range(kept):
+        v = J[members + w]
         for axis in range(3):
             F[half_floats + axis * new_capacity + w] = F[x + axis * capacity + v]
         for i in range(3):
