@@ -1,9 +1,9 @@
 """The mesh of a degenerate network as the limit of meshes of perturbed ones.
 
 While a perturbation is small enough not to change which planes meet, every vertex is the intersection of the same
-planes of the same linear pieces, all shifted in proportion to its scale. So vertices move linearly in the scale, and two
-scales give them at scale zero exactly, up to rounding: x(0) = x(1/2) + (x(1/2) - x(1)). That nothing changed is seen from
-the combinatorial keys, which must be the same at both scales.
+planes of the same linear pieces, all shifted in proportion to its scale. So vertices move linearly in the scale, and
+two scales give them at scale zero exactly, up to rounding: x(0) = x(1/2) + (x(1/2) - x(1)). That nothing changed is
+seen from the combinatorial keys, which must be the same at both scales.
 """
 
 from __future__ import annotations

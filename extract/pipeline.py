@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from mn_onnx.extract.box_copies import drop_box_copies
 from mn_onnx.extract.contract import contract_short_edges
+from mn_onnx.extract.flat import FlatRegions, find_flat_regions
 from mn_onnx.extract.limit import SCALES, limit_surface
 from mn_onnx.extract.perturb import perturbation
 from mn_onnx.extract.schedule import Progress, TraversalStatistics, traverse
@@ -28,16 +29,19 @@ PERTURBATION_SIZES = (1e-9, 1e-10, 1e-11, 1e-8)
 COINCIDENCE = 1e-12
 """Vertices closer than this, relative to the box, may be one point: above rounding, below a perturbation's size."""
 
+SHALLOW = 1e-12
+"""A gradient this small, relative to the largest one, may be zero but for rounding."""
+
 
 @dataclass(frozen=True)
 class Degeneracy:
     """What was degenerate about a network in its box, and what was done about it.
 
-    ``found``: sentences that say what the exact traversal came upon; empty for an arrangement in general position.
+    ``found``: sentences that say why the exact traversal could not be trusted; empty where it could.
     ``perturbation``: the relative size of the shifts under which the mesh was found, None if none was needed; the
     vertices have been taken back to the network as it is. ``displacement``: the farthest any vertex was taken back.
-    ``merged_vertices``, ``removed_polygons``: what coincided or had no area. ``box_copies``: polygons in a box face that
-    were left out. ``attempts``: perturbations tried.
+    ``merged_vertices``, ``removed_polygons``: what coincided or had no area. ``box_copies``: polygons in a box face
+    that were left out. ``attempts``: perturbations tried.
     """
 
     found: tuple[str, ...] = ()
@@ -53,12 +57,14 @@ class Degeneracy:
 class Extraction:
     """The level set of a network, and how it was found.
 
-    ``statistics`` are those of the first traversal; ``seconds`` the time of each phase by name (traverse, weld, perturb).
+    ``statistics`` are those of the first traversal; ``seconds`` the time of each phase by name: traverse, weld, flat,
+    and perturb if that was needed.
     """
 
     surface: Surface
     statistics: TraversalStatistics
     degeneracy: Degeneracy
+    flat_regions: FlatRegions
     seconds: dict[str, float]
 
 
@@ -106,46 +112,49 @@ def extract_surface(
     closed mesh the best one found is returned: ``surface.unmatched`` tells, and the caller must.
 
     ``threads``: worker threads, all cores by default; the result is the same for any number. ``progress`` is called a
-    few times a second during traversals, ``on_phase`` with the name of each phase as it begins. Raises ``ValueError`` for
-    a network that is not canonical or an empty box.
+    few times a second during traversals, ``on_phase`` with the name of each phase as it begins. Raises ``ValueError``
+    for a network that is not canonical or an empty box.
     """
     run = _Run(np.asarray(lower, np.float64), np.asarray(upper, np.float64), threads, progress, on_phase)
     with run.phase("traverse"):
         soup, statistics = traverse(network, run.lower, run.upper, threads=threads, progress=progress)
     with run.phase("weld"):
-        surface, found = _welded(soup, run)
-        if not found:
-            surface, degeneracy = _cleaned(surface, run, 0.0, Degeneracy())
-            found = _torn(surface)
-            if narrow := _narrow(surface, run.coincidence):
-                found += (f"{narrow} polygons that may have no width but for rounding",)
-    if not found:
-        return Extraction(surface, statistics, degeneracy, run.seconds)
-    best, best_degeneracy = surface, Degeneracy(found)
-    with run.phase("perturb"):
-        for attempt, size in enumerate(PERTURBATION_SIZES):
-            candidate = _perturbed(network, run, size, attempt)
-            if candidate is None:
-                continue
-            surface, displacement = candidate
-            degeneracy = Degeneracy(found, perturbation=size, displacement=displacement, attempts=attempt + 1)
-            surface, degeneracy = _cleaned(surface, run, run.coincidence, degeneracy)
-            if not _torn(surface):
-                return Extraction(surface, statistics, degeneracy, run.seconds)
-            if surface.unmatched.size < best.unmatched.size:
-                best, best_degeneracy = surface, degeneracy
-    best_degeneracy = replace(best_degeneracy, attempts=len(PERTURBATION_SIZES))
-    return Extraction(best, statistics, best_degeneracy, run.seconds)
+        surface, degeneracy = _as_it_is(soup, run)
+        del soup
+    if degeneracy.found:
+        with run.phase("perturb"):
+            surface, degeneracy = _in_the_limit(network, run, surface, degeneracy)
+    with run.phase("flat"):
+        flat_regions = find_flat_regions(network, run.lower, run.upper, surface)
+    return Extraction(surface, statistics, degeneracy, flat_regions, run.seconds)
 
 
-def _welded(soup: PolygonSoup, run: _Run) -> tuple[Surface, tuple[str, ...]]:
-    """The surface of ``soup``, and what in it only rounding can have caused."""
+def _as_it_is(soup: PolygonSoup, run: _Run) -> tuple[Surface, Degeneracy]:
+    """The surface of an unperturbed ``soup``; ``found`` tells what in it only rounding can have caused."""
     soup, n_dropped = _whole_polygons(soup)
     surface = weld(soup, threads=run.threads)
-    found = _torn(surface)
-    if n_dropped:
-        found = (f"{n_dropped} polygons with fewer than 3 corners", *found)
-    return surface, found
+    if n_dropped or _torn(surface):
+        dropped = (f"{n_dropped} polygons with fewer than 3 corners",) if n_dropped else ()
+        return surface, Degeneracy((*dropped, *_torn(surface)))
+    surface, degeneracy = _cleaned(surface, run, 0.0, Degeneracy())
+    return surface, replace(degeneracy, found=(*_torn(surface), *_doubtful(surface, run.coincidence)))
+
+
+def _in_the_limit(network: Network, run: _Run, torn: Surface, degeneracy: Degeneracy) -> tuple[Surface, Degeneracy]:
+    """The surface under the first perturbation that closes it; if none does, that with the fewest unmatched edges."""
+    best = torn, degeneracy
+    for attempt, size in enumerate(PERTURBATION_SIZES):
+        candidate = _perturbed(network, run, size, attempt)
+        if candidate is None:
+            continue
+        surface, displacement = candidate
+        tried = Degeneracy(degeneracy.found, size, displacement, attempts=attempt + 1)
+        surface, tried = _cleaned(surface, run, run.coincidence, tried)
+        if not _torn(surface):
+            return surface, tried
+        if surface.unmatched.size < best[0].unmatched.size:
+            best = surface, tried
+    return best[0], replace(best[1], attempts=len(PERTURBATION_SIZES))
 
 
 def _whole_polygons(soup: PolygonSoup) -> tuple[PolygonSoup, int]:
@@ -179,6 +188,17 @@ def _narrow(surface: Surface, length: float) -> int:
     """The number of polygons that have an edge of at most ``length`` or are no wider than that."""
     measures = surface.measures
     return int(np.count_nonzero((measures.shortest_edges <= length) | (measures.areas <= length * measures.perimeters)))
+
+
+def _doubtful(surface: Surface, length: float) -> tuple[str, ...]:
+    """What may be due to rounding in a surface that is closed, a sentence each."""
+    slopes = np.abs(surface.gradients).max(axis=1, initial=0.0)
+    shallow = int(np.count_nonzero(slopes <= SHALLOW * slopes.max(initial=0.0)))
+    counts = (
+        (_narrow(surface, length), "polygons that may have no width but for rounding"),
+        (shallow, "polygons on which f may have no slope but for rounding"),
+    )
+    return tuple(f"{count} {what}" for count, what in counts if count)
 
 
 def _cleaned(surface: Surface, run: _Run, length: float, degeneracy: Degeneracy) -> tuple[Surface, Degeneracy]:
