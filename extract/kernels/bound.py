@@ -15,8 +15,11 @@ from mn_onnx.extract.kernels.memory import (
     CELL_FLOATS,
     CELL_VERTICES,
     CENTRE_AT,
+    DEAD,
     ERROR,
     HIGH,
+    KIND,
+    LINEAR,
     LOW,
     OFFSET,
     OUT_COEF,
@@ -31,6 +34,7 @@ from mn_onnx.extract.kernels.memory import (
     SYS_HEADER,
     SYS_LEVELS,
     SYS_ROWS,
+    UNSTABLE,
     padded,
 )
 
@@ -201,14 +205,15 @@ def read_outputs(F, X, J, M, floats, rows, begin, end, first, count):
 def bound_units(F, N, X, J, M, tables, cell, system, floats):
     """Forward pass: bounds, states and relaxations of all rows of the system over the cell.
 
-    Reads the row states in J (STATE_LOW, STATE_HIGH) and narrows them.
+    Reads the row states in J (STATE_LOW, STATE_HIGH) and narrows them, and sets the rows' KIND. Returns the numbers of
+    settled rows whose output is not identically zero (LINEAR), and whose is (DEAD).
     """
     rows, cols, levels = N[system + SYS_ROWS], N[system + SYS_COLS], N[system + SYS_LEVELS]
     level_start = system + SYS_HEADER
     row_unit = level_start + levels + 1
     row_col = row_unit + rows
     col_end = row_col + rows + 1 + 2 * cols
-    first, count = 0, 0
+    first, count, linear, dead = 0, 0, 0, 0
     for level in range(levels):
         begin, end = N[level_start + level], N[level_start + level + 1]
         # The outputs that no later row reads are at the front: extents only grow with the level.
@@ -221,7 +226,17 @@ def bound_units(F, N, X, J, M, tables, cell, system, floats):
             if unit < 0:
                 continue
             settle_row(N, X, J, M, tables, row_col, r, unit)
+            before = count
             count = remember_outputs(N, X, J, M, row_col, rows, r, count)
+            if J[STATE_LOW * M + r] < J[STATE_HIGH * M + r]:
+                J[KIND * M + r] = UNSTABLE
+            elif count > before:
+                J[KIND * M + r] = LINEAR
+                linear += 1
+            else:
+                J[KIND * M + r] = DEAD
+                dead += 1
+    return linear, dead
 
 
 @njit(cache=True, error_model="numpy")

@@ -28,35 +28,11 @@ from mn_onnx.extract.kernels.memory import (
     SYS_LEVELS,
     SYS_ROWS,
     SYS_UNITS,
+    UNSTABLE,
     padded,
     system_floats,
     system_ints,
 )
-
-DEAD, LINEAR, UNSTABLE = 0, 1, 2
-
-
-@njit(cache=True, error_model="numpy")
-def classify_rows(N, X, J, M, system):
-    """J[KIND] of every row: UNSTABLE, LINEAR (settled) or DEAD (settled, output zero). Counts the last two."""
-    rows = N[system + SYS_ROWS]
-    row_unit = system + SYS_HEADER + N[system + SYS_LEVELS] + 1
-    row_col = row_unit + rows
-    linear, dead = 0, 0
-    for r in range(rows):
-        if N[row_unit + r] < 0:
-            continue
-        if J[STATE_LOW * M + r] < J[STATE_HIGH * M + r]:
-            J[KIND * M + r] = UNSTABLE
-            continue
-        kind = DEAD
-        for c in range(N[row_col + r], N[row_col + r + 1]):
-            if X[SLOPE * M + c] != 0.0 or X[OFFSET * M + c] != 0.0:
-                kind = LINEAR
-        J[KIND * M + r] = kind
-        linear += kind
-        dead += 1 - kind
-    return linear, dead
 
 
 @njit(cache=True, error_model="numpy")
@@ -283,8 +259,8 @@ def multiply_settled(F, N, J, M, folded, weights, gathered, settled, work, strid
 def fold(F, N, X, J, M, system, floats, folded, folded_floats, least):
     """Write the folded system at ``folded`` (N) and ``folded_floats`` (F); scratch follows it in F.
 
-    ``least`` is UNSTABLE to substitute all settled rows, LINEAR to leave out the dead ones only. Needs the kinds of
-    `classify_rows` and the relaxations of `bound_units`. `folding_floats` tells how much of F is used.
+    ``least`` is UNSTABLE to substitute all settled rows, LINEAR to leave out the dead ones only. Needs the kinds
+    and relaxations of `bound_units`. `folding_floats` tells how much of F is used.
     """
     rows, cols = N[system + SYS_ROWS], N[system + SYS_COLS]
     row_col = system + SYS_HEADER + N[system + SYS_LEVELS] + 1 + rows

@@ -13,7 +13,7 @@ from typing import NamedTuple
 from numba import njit
 
 from mn_onnx.extract.kernels.bound import MARGIN, bound_output, bound_units, value_range
-from mn_onnx.extract.kernels.fold import DEAD, LINEAR, UNSTABLE, carry_states, classify_rows, fold, folding_floats
+from mn_onnx.extract.kernels.fold import carry_states, fold, folding_floats
 from mn_onnx.extract.kernels.lanes import cycles, pointer
 from mn_onnx.extract.kernels.leaf import emit_leaf
 from mn_onnx.extract.kernels.memory import (
@@ -31,7 +31,9 @@ from mn_onnx.extract.kernels.memory import (
     CUT_FROM,
     CUT_SHARE,
     CUT_TO,
+    DEAD,
     HIGH,
+    LINEAR,
     LOW,
     NEW_INDEX,
     OUT_VALUES,
@@ -46,6 +48,7 @@ from mn_onnx.extract.kernels.memory import (
     SYS_LEVELS,
     SYS_ROWS,
     SYS_UNITS,
+    UNSTABLE,
     VALUES,
     X_REGIONS,
     cell_ints,
@@ -145,7 +148,7 @@ def count_choices(N, J, M, system, most):
 
 @njit(cache=True, error_model="numpy")
 def choose_split(N, X, J, M, tables, system):
-    """Row and knot to split at: of the unstable rows that are affine on the cell, the most evenly divided one."""
+    """Row and knot to split at: of the unstable rows that are affine on the cell, the one that cuts deepest."""
     row_unit = system + SYS_HEADER + N[system + SYS_LEVELS] + 1
     best, best_row, best_knot = -1.0, -1, 0
     for r in range(N[system + SYS_ROWS]):
@@ -165,7 +168,8 @@ def choose_split(N, X, J, M, tables, system):
         if a > first and middle - tables.knots[knot + a - 1] < tables.knots[knot + a] - middle:
             a -= 1
         kappa = tables.knots[knot + a]
-        score = min(high - kappa, kappa - low) / (high - low)
+        norm = (X[r] * X[r] + X[M + r] * X[M + r] + X[2 * M + r] * X[2 * M + r]) ** 0.5
+        score = min(high - kappa, kappa - low) / norm
         if score > best:
             best, best_row, best_knot = score, r, a
     return best_row, best_knot
@@ -236,13 +240,12 @@ def split_cell(
 
 
 @njit(cache=True, error_model="numpy")
-def how_to_fold(N, X, J, M, system):
+def how_to_fold(N, system, linear, dead):
     """UNSTABLE to fold all settled rows of the system, LINEAR to leave out the dead ones, DEAD to keep it as it is.
 
     Substitution costs the cube of the number of units, bounding its square, and leaving out dead rows keeps the zeros
     between layers that are not neighbours: so the more units there are, the longer substitution is put off.
     """
-    linear, dead = classify_rows(N, X, J, M, system)
     units = N[system + SYS_UNITS]
     if units < 64:
         return UNSTABLE if 3 * (linear + dead) >= units else DEAD
@@ -260,7 +263,7 @@ def visit(F, N, X, J, M, control, stack, output, tables, slot_of_tag, cell):
     for r in range(rows):
         J[STATE_LOW * M + r] = N[states + r]
         J[STATE_HIGH * M + r] = N[states + rows + r]
-    bound_units(F, N, X, J, M, tables, cell, system, floats)
+    linear, dead = bound_units(F, N, X, J, M, tables, cell, system, floats)
     radius = bound_output(F, N, X, M, system, floats)
     at = CENTRE_AT * M
     evaluate_affine(F, N, X, M, cell, OUT_VALUES, X[at], X[at + 1], X[at + 2], X[at + 3])
@@ -276,10 +279,8 @@ def visit(F, N, X, J, M, control, stack, output, tables, slot_of_tag, cell):
     row, knot = -1, 0
     if not leaf:
         row, knot = choose_split(N, X, J, M, tables, system)
-    else:
-        classify_rows(N, X, J, M, system)
     form = row
-    least = UNSTABLE if leaf else how_to_fold(N, X, J, M, system)
+    least = UNSTABLE if leaf else how_to_fold(N, system, linear, dead)
     if least > DEAD:
         folded, folded_floats = control[TOP_I], control[TOP_F]
         fold(F, N, X, J, M, system, floats, folded, folded_floats, least)

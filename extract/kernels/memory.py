@@ -43,6 +43,9 @@ X_REGIONS = 37
 (READ_COLS, READ_AT, KIND, BELOW, ABOVE, SIDE_COUNTS) = (16, 17, 18, 19, 20, 21)
 J_REGIONS = 22
 
+# Kinds of rows: settled with output zero, settled, neither.
+DEAD, LINEAR, UNSTABLE = 0, 1, 2
+
 
 @njit(cache=True, error_model="numpy")
 def padded(count: int) -> int:
