@@ -17,11 +17,12 @@ def drop_box_copies(surface: Surface, lower: Floats, upper: Floats, distance: fl
 
     ``lower``, ``upper``: float64 [3]. The neighbours of these polygons end on that box face then.
     """
-    bounds = np.stack([lower, upper], axis=1)
-    on_face = (np.abs(surface.vertices[:, :, None] - bounds) <= distance).reshape(-1, 6)
-    if not on_face.any():
+    bits = np.zeros(surface.n_vertices, np.uint8)
+    for axis, coordinates in enumerate(surface.vertices.T):
+        bits |= (coordinates <= lower[axis] + distance).view(np.uint8) << (2 * axis)
+        bits |= (coordinates >= upper[axis] - distance).view(np.uint8) << (2 * axis + 1)
+    if not bits.any():
         return surface, 0
-    bits = np.packbits(on_face, axis=1, bitorder="little")[:, 0]
     common = np.bitwise_and.reduceat(bits[surface.corners], surface.offsets[:-1])
     if not common.any():
         return surface, 0

@@ -8,19 +8,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mn_onnx.extract.surface import Surface
-from mn_onnx.ir.evaluate import evaluate, gradient
+from mn_onnx.ir.evaluator import Evaluator
 from mn_onnx.ir.network import Network
 
 Floats = NDArray[np.float64]
 
-N_SAMPLES = 4096
+N_SAMPLES = 1024
 """Points of the box, and polygons of the surface, that are looked at."""
 
 STEP = 1e-6
 """How far from its polygon a point beside the surface lies, relative to the box."""
 
 ROUNDING = 1e-12
-"""Values and slopes up to this, relative to the steepest slope times the box, are zero."""
+"""Values up to this, relative to the largest one in the box, are zero; so are slopes that reach no more across it."""
 
 
 @dataclass(frozen=True)
@@ -44,26 +44,27 @@ def find_flat_regions(network: Network, lower: Floats, upper: Floats, surface: S
     ``lower``, ``upper``: float64 [3].
     """
     generator = np.random.default_rng(0)
+    evaluator = Evaluator(network)
     inside = generator.uniform(lower, upper, (N_SAMPLES, network.input_dim))
+    values = evaluator.values(inside)
     size = float((upper - lower).max())
-    beside = np.zeros((0, network.input_dim))
-    if surface.n_polygons:
-        polygons = np.linspace(0, surface.n_polygons - 1, min(N_SAMPLES, surface.n_polygons)).astype(np.int64)
-        beside = _centres(surface)[polygons] + STEP * size * surface.normals[polygons]
-    steepest = max(np.abs(gradient(network, inside)).max(initial=0.0), np.abs(surface.gradients).max(initial=0.0))
-    share, bordering = (_zero_share(network, points, float(steepest), size) for points in (inside, beside))
-    return FlatRegions(share, bordering)
+    largest = float(np.abs(values).max()) or 1.0
+    share = _flat_share(evaluator, inside, values, largest, size)
+    if not surface.n_polygons:
+        return FlatRegions(share)
+    polygons = np.linspace(0, surface.n_polygons - 1, min(N_SAMPLES, surface.n_polygons)).astype(np.int64)
+    beside = _centres(surface, polygons) + STEP * size * surface.normals[polygons]
+    return FlatRegions(share, _flat_share(evaluator, beside, evaluator.values(beside), largest, size))
 
 
-def _centres(surface: Surface) -> Floats:
-    sums = np.add.reduceat(surface.vertices[surface.corners], surface.offsets[:-1], axis=0)
-    return np.asarray(sums / surface.polygon_sizes[:, None])
+def _centres(surface: Surface, polygons: NDArray[np.int64]) -> Floats:
+    """The mean of the corners of each of ``polygons``, float64 [n, 3]."""
+    corners = zip(surface.offsets[polygons], surface.offsets[polygons + 1], strict=True)
+    return np.array([surface.vertices[surface.corners[begin:end]].mean(axis=0) for begin, end in corners])
 
 
-def _zero_share(network: Network, points: Floats, steepest: float, size: float) -> float:
-    """The part of ``points`` where value and gradient are zero."""
-    if not len(points):
-        return 0.0
-    zeros = points[np.abs(evaluate(network, points)) <= ROUNDING * steepest * size]
-    flat = (np.abs(gradient(network, zeros)) <= ROUNDING * steepest).all(axis=1)
+def _flat_share(evaluator: Evaluator, points: Floats, values: Floats, largest: float, size: float) -> float:
+    """The part of ``points`` where both ``values`` and gradients are zero."""
+    zeros = points[np.abs(values) <= ROUNDING * largest]
+    flat = (np.abs(evaluator.gradients(zeros)) * size <= ROUNDING * largest).all(axis=1)
     return int(np.count_nonzero(flat)) / len(points)

@@ -1,0 +1,100 @@
+"""Level sets of networks over two coordinates and over one, by way of the prism and the slab over them.
+
+The network is extended to three dimensions on which it does not depend. Its level set there is the prism of the curve,
+a polygon per segment, or a square per root; what is sought is its rim on the lower face of the box.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mn_onnx.extract.curve import Curve, Roots
+from mn_onnx.extract.edges import half_edge_heads
+from mn_onnx.extract.embed import embed
+from mn_onnx.extract.pipeline import Extraction, extract_surface
+from mn_onnx.extract.schedule import Progress
+from mn_onnx.ir.network import Network
+
+Floats = NDArray[np.float64]
+
+LOWER_Z = 4  # the box face that holds the rim of a prism
+
+
+@dataclass(frozen=True, eq=False)
+class CurveExtraction:
+    """The level set of a network over two coordinates, and the extraction of the prism over it."""
+
+    curve: Curve
+    prism: Extraction
+
+
+@dataclass(frozen=True, eq=False)
+class RootExtraction:
+    """The level set of a network over one coordinate, and the extraction of the squares over it."""
+
+    roots: Roots
+    slab: Extraction
+
+
+def extract_curve(
+    network: Network,
+    lower: Floats,
+    upper: Floats,
+    *,
+    threads: int | None = None,
+    progress: Callable[[Progress], None] | None = None,
+    on_phase: Callable[[str], None] | None = None,
+) -> CurveExtraction:
+    """The level set f = 0 of a canonical network over two coordinates, in the box ``lower``..``upper`` (float64 [2]).
+
+    Arguments, convention and errors as in `extract_surface`; ``curve.problems()`` tells if it does not close.
+    """
+    _check_dimension(network, 2)
+    wide, low, high = embed(network, lower, upper)
+    prism = extract_surface(wide, low, high, threads=threads, progress=progress, on_phase=on_phase)
+    surface = prism.surface
+    rim = np.flatnonzero((surface.twins < 0) & (surface.box_faces == LOWER_Z))
+    ends = np.stack([surface.corners[rim], half_edge_heads(surface.offsets, surface.corners)[rim]], axis=1)
+    used, numbers = np.unique(ends, return_inverse=True)
+    polygons = np.searchsorted(surface.offsets, rim, side="right") - 1
+    curve = Curve.from_segments(
+        surface.vertices[used, :2],
+        numbers.reshape(-1, 2).astype(np.int64),
+        surface.gradients[polygons, :2],
+        surface.errors[polygons],
+        low[:2],
+        high[:2],
+    )
+    return CurveExtraction(curve, prism)
+
+
+def extract_roots(
+    network: Network,
+    lower: Floats,
+    upper: Floats,
+    *,
+    threads: int | None = None,
+    progress: Callable[[Progress], None] | None = None,
+    on_phase: Callable[[str], None] | None = None,
+) -> RootExtraction:
+    """The level set f = 0 of a canonical network over one coordinate between ``lower`` and ``upper`` (float64 [1]).
+
+    Arguments, convention and errors as in `extract_surface`.
+    """
+    _check_dimension(network, 1)
+    wide, low, high = embed(network, lower, upper)
+    slab = extract_surface(wide, low, high, threads=threads, progress=progress, on_phase=on_phase)
+    surface = slab.surface
+    positions = surface.vertices[surface.corners[surface.offsets[:-1]], 0]
+    order = np.argsort(positions, kind="stable")
+    slopes, errors = surface.gradients[order, 0], surface.errors[order]
+    return RootExtraction(Roots(positions[order], slopes, errors, float(low[0]), float(high[0])), slab)
+
+
+def _check_dimension(network: Network, dimension: int) -> None:
+    if network.input_dim != dimension:
+        raise ValueError(f"the network has {network.input_dim} inputs where {dimension} are needed")
