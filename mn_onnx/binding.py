@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -45,14 +46,18 @@ def graph_inputs(model: onnx.ModelProto) -> list[GraphInput]:
         if value.name in fixed:
             continue
         kind = value.type.tensor_type
-        if not value.type.HasField("tensor_type") or not kind.HasField("shape"):
-            problems.append(_problem(value.name, "the input is not a tensor of known rank", "export it as a tensor"))
+        if not value.type.HasField("tensor_type"):
+            problems.append(_problem(value.name, "the input is not a tensor", "export it as a tensor"))
             continue
         sizes = [
             axis.dim_value if axis.HasField("dim_value") and axis.dim_value > 0 else None for axis in kind.shape.dim
         ]
         dtype = np.dtype(onnx.helper.tensor_dtype_to_np_dtype(kind.elem_type))
-        inputs.append(GraphInput(value.name, dtype, tuple(sizes), tuple(axis.dim_param for axis in kind.shape.dim)))
+        free = tuple(axis.dim_param for axis in kind.shape.dim)
+        if not kind.HasField("shape"):
+            # Without a declared rank, points [N, d] are assumed.
+            sizes, free = [None, None], ("", "")
+        inputs.append(GraphInput(value.name, dtype, tuple(sizes), free))
     if problems:
         raise ModelRefused(problems)
     if not inputs:
@@ -60,6 +65,23 @@ def graph_inputs(model: onnx.ModelProto) -> list[GraphInput]:
             [_problem("", "the graph has no inputs: it is a constant", "export it with the points as input")]
         )
     return inputs
+
+
+def with_width(inputs: Sequence[GraphInput], width: int) -> list[GraphInput]:
+    """The inputs, with ``width`` columns in those that declare no size at all, as of shape [N, d] with d unknown."""
+    return [
+        dataclasses.replace(entry, shape=(*entry.shape[:-1], width)) if _has_free_width(entry) else entry
+        for entry in inputs
+    ]
+
+
+def has_free_width(inputs: Sequence[GraphInput], bind: Mapping[str, ArrayLike]) -> bool:
+    """Whether an input that is not bound declares no size at all, so that its number of columns is unknown."""
+    return any(_has_free_width(entry) for entry in inputs if entry.name not in bind)
+
+
+def _has_free_width(entry: GraphInput) -> bool:
+    return len(entry.shape) > 1 and not any(entry.shape) and is_float(entry.dtype)
 
 
 def bind_inputs(

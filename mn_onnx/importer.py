@@ -12,9 +12,9 @@ import onnx
 import onnx.inliner
 from numpy.typing import ArrayLike
 
-from mn_onnx.binding import bind_inputs, graph_inputs
+from mn_onnx.binding import bind_inputs, graph_inputs, has_free_width, with_width
 from mn_onnx.errors import ModelRefused, Problem, UsageError
-from mn_onnx.ir.network import AffineRow, Network, Unit
+from mn_onnx.ir.network import AffineRow, Floats, Integers, Network, Unit
 from mn_onnx.layout import BoundInput, Layout, Output, PointInput, point_count
 from mn_onnx.lowering import LOWERINGS, REFUSALS
 from mn_onnx.lowering.context import Context, GraphValue, Scope
@@ -33,6 +33,8 @@ from mn_onnx.symbolic_store import Store
 
 FREE_BATCHES = (2, 5)
 """A model of any number of points is run with these numbers; it must compute the same function with both."""
+WIDTHS = (3, 2, 1)
+"""Numbers of columns that are tried where the model declares none."""
 MOST_POINTS = 4096
 """A static batch up to this size is run as it is; a larger one as if its size were free."""
 
@@ -79,20 +81,40 @@ def import_network(
     """
     if model.functions:
         model = onnx.inliner.inline_local_functions(model)
-    inputs, dim = bind_inputs(graph_inputs(model), bind or {}, coordinates)
+    inputs, bound = graph_inputs(model), bind or {}
+    if not has_free_width(inputs, bound):
+        return _import(model, bind_inputs(inputs, bound, coordinates), output, channel)
+    refusals = []
+    for width in WIDTHS:
+        try:
+            return _import(model, bind_inputs(with_width(inputs, width), bound, coordinates), output, channel)
+        except ModelRefused as error:
+            refusals.append(error)
+    raise refusals[0]
+
+
+def _import(
+    model: onnx.ModelProto,
+    roles: tuple[tuple[PointInput | BoundInput, ...], int],
+    output: str | None,
+    channel: int | None,
+) -> Imported:
+    inputs, dim = roles
     points = [entry for entry in inputs if isinstance(entry, PointInput)]
     batch = point_count(points[0].shape, points[0].axis)
     layout = Layout(inputs, dim, batch, Output("", None, 0))
     if batch is not None and batch <= MOST_POINTS:
         run = _run(model, layout, batch, output, channel)
+        network = _network(run, dim)
     else:
-        run = _run_with_two_batches(model, layout, output, channel)
-    network = _network(run, dim)
+        run, network = _run_with_two_batches(model, layout, output, channel)
     metadata = {entry.key: entry.value for entry in model.metadata_props}
     return Imported(network, dataclasses.replace(layout, output=run.output), dim, metadata)
 
 
-def _run_with_two_batches(model: onnx.ModelProto, layout: Layout, output: str | None, channel: int | None) -> _Run:
+def _run_with_two_batches(
+    model: onnx.ModelProto, layout: Layout, output: str | None, channel: int | None
+) -> tuple[_Run, Network]:
     """Run with two batch sizes. Raises `ModelRefused`, naming the first node that differs, unless both agree."""
     free = layout if layout.batch is None else _with_free_batch(layout)
     try:
@@ -106,9 +128,10 @@ def _run_with_two_batches(model: onnx.ModelProto, layout: Layout, output: str | 
             "export with a dynamic number of points",
         )
         raise ModelRefused([problem, *error.problems]) from error
-    if first.output != second.output or not _same(_network(first, layout.dim), _network(second, layout.dim)):
+    network = _network(first, layout.dim)
+    if first.output != second.output or not _same(network, _network(second, layout.dim)):
         raise ModelRefused([_batch_problem(first.context, second.context)])
-    return first
+    return first, network
 
 
 def _with_free_batch(layout: Layout) -> Layout:
@@ -267,24 +290,20 @@ def _network(run: _Run, dim: int) -> Network:
     """Units that the chosen output needs, in topological order, with variables renumbered."""
     store = run.context.store
     rows = store.rows(run.field[:1], run.output.name)
-    needed = set()
-    pending = [int(v) for v in rows.columns]
-    while pending:
-        variable = pending.pop()
-        if variable >= dim and variable not in needed:
-            needed.add(variable)
+    needed = np.zeros(dim + len(store.units), np.bool_)
+    needed[rows.columns] = True
+    for variable in range(len(needed) - 1, dim - 1, -1):
+        if needed[variable]:
             base = store.bases[store.units[variable - dim][0]]
-            pending += store.directions[base.direction][0].tolist()
-    ordered = sorted(needed)
-    number = {variable: variable for variable in range(dim)} | {v: dim + i for i, v in enumerate(ordered)}
+            needed[store.directions[base.direction][0]] = True
+    needed[:dim] = True
+    number = np.cumsum(needed) - 1
 
-    def row(columns: np.ndarray, weights: np.ndarray, bias: float) -> AffineRow:
-        renumbered = np.array([number[v] for v in columns.tolist()], np.int64)
-        return AffineRow(renumbered, np.asarray(weights, np.float64), float(bias))
+    def row(columns: Integers, weights: Floats, bias: float) -> AffineRow:
+        return AffineRow(number[columns], weights, float(bias))
 
     units = []
-    for variable in ordered:
-        key = store.units[variable - dim]
+    for key in (store.units[variable - dim] for variable in np.flatnonzero(needed)[dim:].tolist()):
         base = store.bases[key[0]]
         columns, weights = store.directions[base.direction]
         units.append(Unit(row(columns, weights * base.scale, base.shift), (store.functions[key[1]],), store.names[key]))

@@ -88,7 +88,7 @@ class Layout:
             columns = np.tile(entry.values, (n, 1))
             moving = [k for k, coordinate in enumerate(entry.columns) if coordinate >= 0]
             columns[:, moving] = points[:, [entry.columns[k] for k in moving]]
-            feeds[entry.name] = np.ascontiguousarray(entry.arrange(columns).astype(entry.dtype))
+            feeds[entry.name] = np.array(entry.arrange(columns), entry.dtype, order="C")
         return feeds
 
     def take(self, values: np.ndarray) -> Floats:

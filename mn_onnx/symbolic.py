@@ -197,13 +197,25 @@ def groups(*keys: Array) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """
     n = len(keys[0])
     code = np.zeros(n, np.int64)
-    if n:
-        for key in keys:
-            if not (key == key[0]).all():
-                values, inverse = np.unique(key, return_inverse=True)
-                combined = code * len(values) + inverse
-                code = np.unique(combined, return_inverse=True)[1] if combined.max() > n else combined
-    if not code.any():
-        return np.zeros(min(n, 1), np.int64), code
-    _, first, inverse = np.unique(code, return_index=True, return_inverse=True)
-    return first, inverse
+    for key in keys:
+        if n and not (key == key[0]).all():
+            numbers = _numbered(key)
+            code = _numbered(code * (int(numbers.max()) + 1) + numbers)
+    first = np.zeros(int(code.max()) + 1 if n else 0, np.int64)
+    # Of several assignments to one place the last one holds.
+    first[code[::-1]] = np.arange(n - 1, -1, -1)
+    return first, code
+
+
+def _numbered(key: Array) -> NDArray[np.int64]:
+    """The values of a key replaced by consecutive numbers in increasing order."""
+    if key.dtype.kind in "bi":
+        integers = key.astype(np.int64)
+        lowest = int(integers.min())
+        extent = int(integers.max()) - lowest + 1
+        if extent <= 4 * key.size + 1024:
+            # A table is several times faster than sorting.
+            present = np.zeros(extent, np.int64)
+            present[integers - lowest] = 1
+            return (np.cumsum(present) - 1)[integers - lowest]
+    return np.unique(key, return_inverse=True)[1]

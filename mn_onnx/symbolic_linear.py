@@ -7,7 +7,6 @@ from numpy.typing import NDArray
 
 from mn_onnx.symbolic import CONSTANT, NO_POINT, Constant, Tensor, check_size, join, lift
 from mn_onnx.symbolic_algebra import Algebra
-from mn_onnx.symbolic_store import Rows
 
 Floats = NDArray[np.float64]
 
@@ -66,11 +65,8 @@ def _contract_row(
     refused = row.refused
     good = row[~refused]
     rows = algebra.store.rows(good, algebra.node)
-    transposed = weights[~refused].T
-    constants = transposed @ rows.constants
-    if bias is not None:
-        constants = constants + bias
-    base, function, scale, offset = algebra.store.elements(Rows(rows.columns, transposed @ rows.matrix, constants))
+    total = rows.combined(weights[~refused].T, 0.0 if bias is None else bias)
+    base, function, scale, offset = algebra.store.elements(total)
     if refused.any():
         reached = weights[refused] != 0.0
         for column in np.flatnonzero(reached.any(axis=0)).tolist():

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mn_onnx.ir.expression import Expression, T
-from mn_onnx.symbolic import CONSTANT, IDENTITY, Tensor, groups
+from mn_onnx.symbolic import CONSTANT, IDENTITY, Tensor
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -35,6 +35,19 @@ class Rows:
     columns: Integers
     matrix: Floats
     constants: Floats
+
+    def combined(self, weights: Floats, bias: Floats | float = 0.0) -> Rows:
+        """``weights`` [m, n] times these rows, plus ``bias`` in the constants."""
+        constants = weights @ self.constants + bias
+        counts = np.count_nonzero(self.matrix, axis=1)
+        columns = np.abs(self.matrix).argmax(axis=1) if self.matrix.size else np.zeros(0, np.int64)
+        if (counts == 1).all() and np.unique(columns).size == len(counts) == self.columns.size:
+            # The usual case behind a layer of activations: every row is one variable of its own.
+            matrix = np.empty((len(weights), len(counts)))
+            matrix[:, columns] = weights * self.matrix[np.arange(len(counts)), columns]
+        else:
+            matrix = weights @ self.matrix
+        return Rows(self.columns, matrix, constants)
 
 
 class Store:
@@ -123,15 +136,16 @@ class Store:
 
     def name_elements(self, tensor: Tensor, node: str) -> None:
         """Call units that may come of the elements after ``node`` and their place among the elements of their point."""
-        nonlinear = np.flatnonzero(tensor.live & (tensor.function != IDENTITY))
-        if not nonlinear.size:
+        nonlinear = (tensor.live & (tensor.function != IDENTITY)).reshape(-1)
+        if not nonlinear.any():
             return
         point = tensor.point.reshape(-1)
-        first, _ = groups(tensor.base.reshape(-1)[nonlinear], tensor.function.reshape(-1)[nonlinear])
-        places = {p: np.cumsum(point == p) - 1 for p in np.unique(point[nonlinear[first]]).tolist()}
-        for position in nonlinear[first].tolist():
-            key = (int(tensor.base.flat[position]), int(tensor.function.flat[position]))
-            self.names.setdefault(key, f"{node}[{places[int(point[position])][position]}]")
+        # The first point stands for all: the functions of the others are the same, unless the model is refused.
+        mine = np.flatnonzero(point == point[nonlinear.argmax()])
+        base, function = tensor.base.reshape(-1)[mine].tolist(), tensor.function.reshape(-1)[mine].tolist()
+        for place, key in enumerate(zip(base, function, strict=True)):
+            if nonlinear[mine[place]]:
+                self.names.setdefault(key, f"{node}[{place}]")
 
     # Rows
 

@@ -31,7 +31,7 @@ def model_of(
     nodes: Sequence[onnx.NodeProto],
     constants: Mapping[str, ArrayLike],
     *,
-    inputs: Mapping[str, Sequence[int | str]] | None = None,
+    inputs: Mapping[str, Sequence[int | str | None] | None] | None = None,
     outputs: Sequence[str] = ("y",),
     opset: int = 17,
     domains: Sequence[str] = (),
@@ -40,7 +40,7 @@ def model_of(
     """A model of the given nodes; inputs and outputs are float32 unless ``types`` says otherwise."""
     types = types or {}
 
-    def info(name: str, shape: Sequence[int | str] | None) -> onnx.ValueInfoProto:
+    def info(name: str, shape: Sequence[int | str | None] | None) -> onnx.ValueInfoProto:
         return helper.make_tensor_value_info(name, types.get(name, TensorProto.FLOAT), shape)
 
     graph = helper.make_graph(

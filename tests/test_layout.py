@@ -160,6 +160,20 @@ def test_scalar_time_and_integer_index() -> None:
     assert "index" in str(refused.value)
 
 
+@pytest.mark.parametrize("shape", [("N", "D"), (None, None), None])
+@pytest.mark.parametrize("width", [1, 2, 3])
+def test_a_number_of_columns_that_is_not_declared_is_found(shape: Any, width: int) -> None:
+    model = model_of(field(), constants(width), inputs={"x": shape})
+    assert assert_agrees(model).input_dim == width
+
+
+def test_three_scalars() -> None:
+    nodes = [node("Unsqueeze", [name, "axes"], [name + "1"]) for name in "abc"]
+    nodes += [node("Concat", ["a1", "b1", "c1"], ["all"], axis=0), *field("all")]
+    model = model_of(nodes, constants() | {"axes": int64(0)}, inputs=dict.fromkeys("abc", ()))
+    assert assert_agrees(model).layout.batch == 1
+
+
 WRONG: dict[str, dict[str, Any]] = {
     "unknown input": {"bind": {"latent": 1.0}},
     "unknown column": {"bind": {"x[9]": 1.0}},

@@ -136,7 +136,7 @@ class Context:
             return self._opaque(node, frozenset({self.report(node, error.reason, error.remedy)}))
         except TooLargeError as error:
             return self._opaque(node, frozenset({self.report(node, str(error), "export with fewer points at once")}))
-        except (ArithmeticError, IndexError, KeyError, TypeError, ValueError) as error:
+        except (ArithmeticError, AttributeError, LookupError, MemoryError, TypeError, ValueError) as error:
             reason = f"it cannot be evaluated: {error}"
             return self._opaque(node, frozenset({self.report(node, reason, "check the model with onnx.checker")}))
         values: list[GraphValue] = []

@@ -6,7 +6,7 @@ from mn_onnx.lowering import LOWERINGS
 
 
 def operator_table() -> str:
-    """Markdown: one row per operator with its domain, the versions from which its definitions hold, and its fidelity."""
+    """Markdown, one row per operator: domain, versions from which its definitions hold, and fidelity."""
     rows = [
         (domain or "ai.onnx", operator, ", ".join(str(entry.since) for entry in entries), entries[-1].fidelity)
         for (domain, operator), entries in LOWERINGS.items()
