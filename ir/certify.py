@@ -12,7 +12,7 @@ from mn_onnx.ir.evaluate import evaluate
 from mn_onnx.ir.network import Floats, Network
 
 # Arithmetic operations that a certificate may cost by default: a few seconds.
-DEFAULT_WORK = 2e9
+DEFAULT_WORK = 1e9
 SAMPLES = 4096
 # Dividing boxes ends once the bound is this close to a difference that was seen.
 CLOSE_ENOUGH = 2.0

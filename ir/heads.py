@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -92,18 +93,26 @@ def invert_expression(expression: Expression, target: float, lower: float, upper
     if not direction or scalar.discontinuities(expression, lower, upper):
         return Inverse()
     ends = jet(expression, np.array([lower, upper]), np.array([lower, upper])).value
-    first, last = (0, 1) if direction > 0 else (1, 0)
+    at_least, at_greatest = (0, 1) if direction > 0 else (1, 0)
     # Beyond or within rounding of the end values: a saturated function never reaches its limit.
-    if not ends.upper[first] < target < ends.lower[last]:
+    if not ends.upper[at_least] < target < ends.lower[at_greatest]:
         return Inverse(reason=f"values on its range over the box lie between {least:.9g} and {greatest:.9g} only")
+    # Rounding makes the function take its target on a whole interval of arguments; the middle is the best of them,
+    # and zero, where it is one of them, surely meant.
+    first = _last_before(expression, lower, upper, lambda value: direction * (value - target) < 0)
+    last = _last_before(expression, lower, upper, lambda value: direction * (value - target) <= 0)
+    argument = 0.0 if first < 0.0 < last else 0.5 * first + 0.5 * last
+    return Inverse(argument, direction)
+
+
+def _last_before(expression: Expression, lower: float, upper: float, is_before: Callable[[float], bool]) -> float:
+    """The last argument, to the last bit, at which a monotone function ``is_before`` some value."""
     low, high = lower, upper
     while True:
         middle = 0.5 * low + 0.5 * high
         if not low < middle < high:
-            break
-        if direction * (float(scalar.evaluate(expression, np.array(middle))) - target) < 0:
+            return low
+        if is_before(float(scalar.evaluate(expression, np.array(middle)))):
             low = middle
         else:
             high = middle
-    misses = np.abs(scalar.evaluate(expression, np.array([low, high])) - target)
-    return Inverse(low if misses[0] < misses[1] else high, direction)

@@ -64,13 +64,13 @@ def _strip(program: Program) -> Program | None:
 
 
 def _run(program: Program) -> tuple[Program, bool]:
-    modified = False
+    imported = program.network
     while not program.empty_reason:
         stripped = _strip(program)
         if stripped is None:
             break
-        program, modified = stripped, True
-    return program, modified
+        program = stripped
+    return program, program.network is not imported
 
 
 STRIP_HEADS = Pass("strip monotone heads", _run, (well_formed, piecewise_linear_recognised), (well_formed,))

@@ -64,7 +64,7 @@ def default_tolerances(
             tolerances.append(0.0)
             continue
         require_bounded(function, lower, upper)
-        profile = bend_profile(function, lower, upper, kinks(function, lower, upper).tolist())
+        profile = bend_profile(function, lower, upper, tuple(kinks(function, lower, upper).tolist()))
         smallest = SMALLEST_TOLERANCE * max(1.0, abs(lower), abs(upper))
         tolerances.append(max(error_of_knots(profile, knots_per_period), smallest))
     return tuple(tolerances)

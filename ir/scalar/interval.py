@@ -23,6 +23,9 @@ class Interval:
     lower: Floats
     upper: Floats
 
+    def __getitem__(self, where: slice) -> Interval:
+        return Interval(self.lower[where], self.upper[where])
+
     @property
     def magnitude(self) -> Floats:
         """The largest absolute value."""

@@ -27,6 +27,9 @@ class Jet:
     slope: Interval
     curvature: Interval
 
+    def __getitem__(self, where: slice) -> Jet:
+        return Jet(self.value[where], self.slope[where], self.curvature[where])
+
 
 @dataclass(frozen=True, eq=False)
 class Truth:

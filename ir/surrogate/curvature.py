@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import functools
 from dataclasses import dataclass
 
 import numpy as np
@@ -40,6 +40,7 @@ class BendProfile:
         return float(self.bend.sum())
 
 
+@functools.lru_cache(maxsize=1024)
 def kinks(expression: Expression, lower: float, upper: float) -> Floats:
     """The points inside ``(lower, upper)`` where the slope of ``expression`` jumps noticeably."""
     candidates = breakpoints(expression, lower, upper)
@@ -56,7 +57,8 @@ def kinks(expression: Expression, lower: float, upper: float) -> Floats:
     return candidates[~smooth]
 
 
-def bend_profile(expression: Expression, lower: float, upper: float, at: Sequence[float]) -> BendProfile:
+@functools.lru_cache(maxsize=1024)
+def bend_profile(expression: Expression, lower: float, upper: float, at: tuple[float, ...]) -> BendProfile:
     """The bend of ``expression`` between the points ``at`` on ``[lower, upper]``.
 
     Raises `UndefinedFunction` where it is unbounded or undefined.
@@ -98,6 +100,7 @@ def _lobes(expression: Expression, t: Floats) -> int:
     return int(1 + np.count_nonzero(np.diff(signs))) if signs.size else 0
 
 
+@functools.lru_cache(maxsize=1024)
 def require_bounded(expression: Expression, lower: float, upper: float) -> None:
     """Raise `UndefinedFunction` if ``expression`` jumps, is unbounded or undefined on ``[lower, upper]``."""
     jumps = discontinuities(expression, lower, upper)
