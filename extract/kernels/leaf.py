@@ -61,43 +61,21 @@ def emit_polygon(X, J, M, output, tables, count, polygon, tags, hash0, hash1, gr
 
 
 @njit(cache=True, error_model="numpy")
-def substitute_row(F, N, X, J, M, system, floats, tables, r, target):
-    """Affine form of row ``r`` at ``X[target : target + 4]`` under the states chosen for the rows before it."""
+def substitute(F, N, X, J, M, system, tables, row, weights, stride, target):
+    """Add to the affine form ``X[target : target + 4]`` what it reads of rows before ``row`` as chosen.
+
+    The weight on column ``c`` is ``F[weights + c * stride]``.
+    """
     rows = N[system + SYS_ROWS]
     row_unit = system + SYS_HEADER + N[system + SYS_LEVELS] + 1
     row_col = row_unit + rows
     col_begin = row_col + rows + 1 + N[system + SYS_COLS]
-    c0, c1, c2, c3 = F[floats + r], F[floats + rows + r], F[floats + 2 * rows + r], F[floats + 3 * rows + r]
-    for q in range(r):
+    c0, c1, c2, c3 = X[target], X[target + 1], X[target + 2], X[target + 3]
+    for q in range(row):
         for c in range(N[row_col + q], N[row_col + q + 1]):
-            if N[col_begin + c] > r:
+            if N[col_begin + c] > row:
                 break
-            w = F[floats + 4 * rows + c * rows + r]
-            if w != 0.0:
-                unit = N[row_unit + q]
-                pieces = tables.first_knot[unit + 1] - tables.first_knot[unit] + 1
-                piece = tables.first_piece[unit] + (c - N[row_col + q]) * pieces + J[CHOICE * M + q]
-                slope = w * tables.slopes[piece]
-                at = FORMS * M + 4 * q
-                c0 += slope * X[at]
-                c1 += slope * X[at + 1]
-                c2 += slope * X[at + 2]
-                c3 += slope * X[at + 3] + w * tables.intercepts[piece]
-    X[target], X[target + 1], X[target + 2], X[target + 3] = c0, c1, c2, c3
-
-
-@njit(cache=True, error_model="numpy")
-def substitute_output(F, N, X, J, M, system, floats, tables, target):
-    """Affine form of the output at ``X[target : target + 4]`` under the chosen states of all rows."""
-    rows, cols = N[system + SYS_ROWS], N[system + SYS_COLS]
-    row_unit = system + SYS_HEADER + N[system + SYS_LEVELS] + 1
-    row_col = row_unit + rows
-    out_weights = floats + 4 * rows + cols * rows
-    out = out_weights + padded(cols)
-    c0, c1, c2, c3 = F[out], F[out + 1], F[out + 2], F[out + 3]
-    for q in range(rows):
-        for c in range(N[row_col + q], N[row_col + q + 1]):
-            w = F[out_weights + c]
+            w = F[weights + c * stride]
             unit = N[row_unit + q]
             pieces = tables.first_knot[unit + 1] - tables.first_knot[unit] + 1
             piece = tables.first_piece[unit] + (c - N[row_col + q]) * pieces + J[CHOICE * M + q]
@@ -108,6 +86,25 @@ def substitute_output(F, N, X, J, M, system, floats, tables, target):
             c2 += slope * X[at + 2]
             c3 += slope * X[at + 3] + w * tables.intercepts[piece]
     X[target], X[target + 1], X[target + 2], X[target + 3] = c0, c1, c2, c3
+
+
+@njit(cache=True, error_model="numpy")
+def substitute_row(F, N, X, J, M, system, floats, tables, r, target):
+    """Affine form of row ``r`` at ``X[target : target + 4]`` under the states chosen for the rows before it."""
+    rows = N[system + SYS_ROWS]
+    for axis in range(4):
+        X[target + axis] = F[floats + axis * rows + r]
+    substitute(F, N, X, J, M, system, tables, r, floats + 4 * rows + r, rows, target)
+
+
+@njit(cache=True, error_model="numpy")
+def substitute_output(F, N, X, J, M, system, floats, tables, target):
+    """Affine form of the output at ``X[target : target + 4]`` under the chosen states of all rows."""
+    rows, cols = N[system + SYS_ROWS], N[system + SYS_COLS]
+    out_weights = floats + 4 * rows + cols * rows
+    for axis in range(4):
+        X[target + axis] = F[out_weights + padded(cols) + axis]
+    substitute(F, N, X, J, M, system, tables, rows, out_weights, 1, target)
 
 
 @njit(cache=True, error_model="numpy")
