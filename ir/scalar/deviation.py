@@ -43,10 +43,9 @@ def _bulge(enclosure: Jet, width: Floats, limit: Interval) -> Interval:
     A function with curvature in [a, b] stays within ``width**2 / 8`` times that of its chord (interpolation error), one
     with slope in [p, q] within ``width * (q - p) / 4``; ``limit`` is what its values alone say.
     """
-    with np.errstate(invalid="ignore", over="ignore"):
-        by_curvature = width * width / 8
-        below = np.fmin(by_curvature * np.maximum(enclosure.curvature.upper, 0.0), width / 4 * enclosure.slope.width)
-        above = np.fmin(by_curvature * np.maximum(-enclosure.curvature.lower, 0.0), width / 4 * enclosure.slope.width)
+    by_curvature = width * width / 8
+    below = np.fmin(by_curvature * np.maximum(enclosure.curvature.upper, 0.0), width / 4 * enclosure.slope.width)
+    above = np.fmin(by_curvature * np.maximum(-enclosure.curvature.lower, 0.0), width / 4 * enclosure.slope.width)
     # A zero width times an unbounded derivative is undefined; the values alone then bound the deviation.
     grow = 1 + 8 * np.finfo(np.float64).eps
     return Interval(
@@ -72,7 +71,8 @@ def deviation(
     attained_low, attained_high = np.full(n, np.inf), np.full(n, -np.inf)
     sure_low, sure_high = np.full(n, np.inf), np.full(n, -np.inf)
     for round_number in range(MOST_ROUNDS):
-        cells = _cell_bounds(expression, low, high, slope[owner], intercept[owner])
+        with np.errstate(all="ignore"):
+            cells = _cell_bounds(expression, low, high, slope[owner], intercept[owner])
         np.minimum.at(attained_low, owner, cells.attained_low)
         np.maximum.at(attained_high, owner, cells.attained_high)
         gap = RELATIVE_GAP * np.maximum(attained_high - attained_low, 0.0)[owner] + SMALLEST_GAP * cells.scale
@@ -104,15 +104,10 @@ def _cell_bounds(expression: Expression, low: Floats, high: Floats, slope: Float
     t = Interval(low, high)
     line = interval.add(interval.multiply(interval.point(slope), t), interval.point(intercept))
     by_value = interval.subtract(enclosure.value, line)
-    with np.errstate(invalid="ignore"):
-        limit = Interval(
-            np.fmin(by_value.lower - ends.lower, 0.0),
-            np.fmax(by_value.upper - ends.upper, 0.0),
-        )
+    limit = Interval(np.fmin(by_value.lower - ends.lower, 0.0), np.fmax(by_value.upper - ends.upper, 0.0))
     bulge = _bulge(enclosure, high - low, limit)
-    with np.errstate(invalid="ignore"):
-        cell_low = np.where(np.isfinite(ends.lower), ends.lower + bulge.lower, -np.inf)
-        cell_high = np.where(np.isfinite(ends.upper), ends.upper + bulge.upper, np.inf)
+    cell_low = np.where(np.isfinite(ends.lower), ends.lower + bulge.lower, -np.inf)
+    cell_high = np.where(np.isfinite(ends.upper), ends.upper + bulge.upper, np.inf)
     return _CellBounds(
         np.nextafter(cell_low, -np.inf),
         np.nextafter(cell_high, np.inf),

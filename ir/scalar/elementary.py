@@ -46,12 +46,12 @@ class Curve:
 
     def over(self, x: Interval) -> Interval:
         """The range over ``x``; unbounded where the function is undefined."""
-        with np.errstate(all="ignore"):
-            at_lower, at_upper = self.function(x.lower), self.function(x.upper)
-            lower, upper = np.minimum(at_lower, at_upper), np.maximum(at_lower, at_upper)
-            for where in self.critical:
-                slack = 4 * np.spacing(abs(where)) if where else 0.0
-                inside = (x.lower <= where + slack) & (x.upper >= where - slack)
+        at_lower, at_upper = self.function(x.lower), self.function(x.upper)
+        lower, upper = np.minimum(at_lower, at_upper), np.maximum(at_lower, at_upper)
+        for where in self.critical:
+            slack = 4 * np.spacing(abs(where)) if where else 0.0
+            inside = (x.lower <= where + slack) & (x.upper >= where - slack)
+            if inside.any():
                 value = float(self.function(np.array([where]))[0])
                 lower = np.where(inside, np.minimum(lower, value), lower)
                 upper = np.where(inside, np.maximum(upper, value), upper)
@@ -179,31 +179,29 @@ def _enclose_half_line(op: str, x: Interval) -> Enclosures:
     return first, second, third
 
 
+def _has_multiple(x: Interval, slack: Floats, offset: float, period: float = 2 * math.pi) -> np.ndarray:
+    """Whether ``offset + k * period`` lies in ``x`` for an integer k."""
+    first = np.ceil((x.lower - slack - offset) / period)
+    last = np.floor((x.upper + slack - offset) / period)
+    has: np.ndarray = first <= last
+    return has
+
+
 def _sine(x: Interval, crest: float, function: Elementwise) -> Interval:
     """A sine whose maxima are at ``crest + 2 k pi``."""
-    with np.errstate(invalid="ignore"):
-        at_lower, at_upper = function(x.lower), function(x.upper)
-        ends = outward_elementary(np.minimum(at_lower, at_upper), np.maximum(at_lower, at_upper))
-        lower, upper = clamp(ends, -1.0, 1.0).lower, clamp(ends, -1.0, 1.0).upper
-        slack = 1e-15 * (1.0 + x.magnitude)
-        for offset, is_crest in ((crest, True), (crest + math.pi, False)):
-            first = np.ceil((x.lower - slack - offset) / (2 * math.pi))
-            last = np.floor((x.upper + slack - offset) / (2 * math.pi))
-            if is_crest:
-                upper = np.where(first <= last, 1.0, upper)
-            else:
-                lower = np.where(first <= last, -1.0, lower)
-        far = ~(x.magnitude <= LARGEST_PHASE)
+    at_lower, at_upper = function(x.lower), function(x.upper)
+    ends = clamp(outward_elementary(np.minimum(at_lower, at_upper), np.maximum(at_lower, at_upper)), -1.0, 1.0)
+    slack = 1e-15 * (1.0 + x.magnitude)
+    upper = np.where(_has_multiple(x, slack, crest), 1.0, ends.upper)
+    lower = np.where(_has_multiple(x, slack, crest + math.pi), -1.0, ends.lower)
+    far = ~(x.magnitude <= LARGEST_PHASE)
     return Interval(np.where(far, -1.0, lower), np.where(far, 1.0, upper))
 
 
 def _enclose_tangent(x: Interval) -> Enclosures:
-    with np.errstate(invalid="ignore"):
-        slack = 1e-15 * (1.0 + x.magnitude)
-        first = np.ceil((x.lower - slack - 0.5 * math.pi) / math.pi)
-        last = np.floor((x.upper + slack - 0.5 * math.pi) / math.pi)
-        has_pole = (first <= last) | ~(x.magnitude <= LARGEST_PHASE)
-        ends = outward_elementary(np.tan(x.lower), np.tan(x.upper))
+    slack = 1e-15 * (1.0 + x.magnitude)
+    has_pole = _has_multiple(x, slack, 0.5 * math.pi, math.pi) | ~(x.magnitude <= LARGEST_PHASE)
+    ends = outward_elementary(np.tan(x.lower), np.tan(x.upper))
     value = select(has_pole, whole(x.lower.shape), ends)
     slope = add(square(value), full(1.0, x.lower.shape))
     return value, slope, multiply(multiply(full(2.0, x.lower.shape), value), slope)

@@ -2,10 +2,13 @@
 
 The four operations and the square root are correctly rounded (IEEE 754), so one step of ``nextafter`` is enough.
 NumPy's elementary functions are accurate to 4 units in the last place (its own accuracy tests), so they get four.
+
+Overflow and undefined ends are part of the arithmetic: callers switch NumPy's floating-point warnings off.
 """
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
 
 import numpy as np
@@ -55,19 +58,22 @@ def whole(shape: tuple[int, ...]) -> Interval:
     return Interval(np.full(shape, -np.inf), np.full(shape, np.inf))
 
 
+def _unless_undefined(values: Floats, otherwise: float) -> Floats:
+    undefined = np.isnan(values)
+    return np.where(undefined, otherwise, values) if undefined.any() else values
+
+
 def outward(lower: Floats, upper: Floats) -> Interval:
     """One rounding step outward; undefined ends (infinity minus infinity) become unbounded."""
     return Interval(
-        np.where(np.isnan(lower), -np.inf, np.nextafter(lower, -np.inf)),
-        np.where(np.isnan(upper), np.inf, np.nextafter(upper, np.inf)),
+        np.nextafter(_unless_undefined(lower, -np.inf), -np.inf), np.nextafter(_unless_undefined(upper, np.inf), np.inf)
     )
 
 
 def outward_elementary(lower: Floats, upper: Floats) -> Interval:
     """Outward by the error of an elementary function, and by the smallest normal number against underflow."""
-    with np.errstate(invalid="ignore", over="ignore", under="ignore"):
-        below = lower - (ELEMENTARY_ULPS * np.spacing(np.abs(lower)) + TINY)
-        above = upper + (ELEMENTARY_ULPS * np.spacing(np.abs(upper)) + TINY)
+    below = lower - (ELEMENTARY_ULPS * np.spacing(np.abs(lower)) + TINY)
+    above = upper + (ELEMENTARY_ULPS * np.spacing(np.abs(upper)) + TINY)
     # The spacing of an infinite number is undefined; such an end stays as it is.
     return Interval(
         np.where(np.isnan(lower), -np.inf, np.where(np.isinf(lower), lower, below)),
@@ -82,8 +88,7 @@ def negate(a: Interval) -> Interval:
 
 def add(a: Interval, b: Interval) -> Interval:
     """``a + b``."""
-    with np.errstate(invalid="ignore", over="ignore"):
-        return outward(a.lower + b.lower, a.upper + b.upper)
+    return outward(a.lower + b.lower, a.upper + b.upper)
 
 
 def subtract(a: Interval, b: Interval) -> Interval:
@@ -93,22 +98,22 @@ def subtract(a: Interval, b: Interval) -> Interval:
 
 def _product(a: Floats, b: Floats) -> Floats:
     # Zero times an unbounded end is zero: the end stands for arbitrarily large but finite numbers.
-    with np.errstate(invalid="ignore", over="ignore", under="ignore"):
-        return np.where((a == 0) | (b == 0), 0.0, a * b)
+    return _unless_undefined(a * b, 0.0)
 
 
 def multiply(a: Interval, b: Interval) -> Interval:
     """``a * b``."""
-    corners = (
-        _product(a.lower, b.lower),
-        _product(a.lower, b.upper),
-        _product(a.upper, b.lower),
-        _product(a.upper, b.upper),
-    )
-    lower = np.minimum(np.minimum(corners[0], corners[1]), np.minimum(corners[2], corners[3]))
-    upper = np.maximum(np.maximum(corners[0], corners[1]), np.maximum(corners[2], corners[3]))
+    if b.lower is b.upper:
+        a, b = b, a
+    # Of a single number only two products need to be compared.
+    corners = [_product(a.lower, b.lower), _product(a.lower, b.upper)]
+    if a.lower is not a.upper:
+        corners += [_product(a.upper, b.lower), _product(a.upper, b.upper)]
+    lower, upper = functools.reduce(np.minimum, corners), functools.reduce(np.maximum, corners)
     result = outward(lower, upper)
     exact_zero = (lower == 0) & (upper == 0)
+    if not exact_zero.any():
+        return result
     return Interval(np.where(exact_zero, 0.0, result.lower), np.where(exact_zero, 0.0, result.upper))
 
 
@@ -116,15 +121,13 @@ def square(a: Interval) -> Interval:
     """``a * a`` as a function of one variable: never negative."""
     largest = a.magnitude
     smallest = np.where((a.lower <= 0) & (a.upper >= 0), 0.0, np.minimum(np.abs(a.lower), np.abs(a.upper)))
-    with np.errstate(over="ignore", under="ignore"):
-        result = outward(smallest * smallest, largest * largest)
+    result = outward(smallest * smallest, largest * largest)
     return Interval(np.maximum(result.lower, 0.0), result.upper)
 
 
 def reciprocal(a: Interval) -> Interval:
     """``1 / a``; unbounded where ``a`` contains zero."""
-    with np.errstate(divide="ignore", over="ignore", under="ignore"):
-        result = outward(1.0 / a.upper, 1.0 / a.lower)
+    result = outward(1.0 / a.upper, 1.0 / a.lower)
     has_zero = (a.lower <= 0) & (a.upper >= 0)
     return Interval(np.where(has_zero, -np.inf, result.lower), np.where(has_zero, np.inf, result.upper))
 

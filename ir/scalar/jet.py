@@ -42,7 +42,8 @@ class Truth:
 def jet(expression: Expression, lower: Floats, upper: Floats) -> Jet:
     """Enclosures of ``expression`` over the intervals ``[lower, upper]`` (float64 [n] each), rounded outward."""
     t = Interval(np.asarray(lower, np.float64), np.asarray(upper, np.float64))
-    result = _jet(rewrite(expression), t, {})
+    with np.errstate(all="ignore"):
+        result = _jet(rewrite(expression), t, {})
     assert isinstance(result, Jet)
     return result
 
@@ -155,8 +156,7 @@ def _real_power(x: Interval, exponent: float) -> Interval:
     # Defined for positive arguments, and monotone there.
     outside = x.lower < 0
     inside = Interval(np.maximum(x.lower, 0.0), np.maximum(x.upper, 0.0))
-    with np.errstate(all="ignore"):
-        ends = inside.lower**exponent, inside.upper**exponent
+    ends = inside.lower**exponent, inside.upper**exponent
     enclosure = interval.outward_elementary(np.minimum(*ends), np.maximum(*ends))
     return interval.select(outside, interval.whole(x.lower.shape), enclosure)
 

@@ -16,7 +16,7 @@ from mn_onnx.ir.scalar.kinks import halve
 FIRST_CELLS = 32
 MOST_CELLS = 1 << 16
 # Cells of a bend profile are halved until each holds at most this part of all bending.
-FINEST_SHARE = 1.0 / 512
+FINEST_SHARE = 1.0 / 256
 MOST_ROUNDS = 40
 # A change of slope below this fraction of the function's steepness is no kink worth a knot: its error is far smaller
 # than that of the curves beside it.
