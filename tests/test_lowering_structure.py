@@ -288,6 +288,37 @@ def test_blocks_of_quantised_weights() -> None:
     assert_agrees(model_of(nodes, constants, opset=21), tolerance=1e-4)
 
 
+@pytest.mark.parametrize("bits", [4, 8])
+@pytest.mark.parametrize("with_zero_points", [False, True])
+def test_weights_packed_for_onnxruntime(bits: int, with_zero_points: bool) -> None:
+    width, rows, block = 40, 6, 16
+    generator = np.random.default_rng(0)
+    packed = generator.integers(0, 256, (rows, 3, block * bits // 8)).astype(np.uint8)
+    constants = {"W": float32(3, width), "B": packed, "s": 0.1 * float32(rows * 3), "V": V}
+    reads = ["p", "B", "s"]
+    if with_zero_points:
+        constants["z0"] = generator.integers(0, 256, (rows, -(-3 * bits // 8))).astype(np.uint8)
+        reads.append("z0")
+    nodes = [
+        LAYER[0],
+        node("MatMulNBits", reads, ["z"], domain="com.microsoft", K=width, N=rows, bits=bits, block_size=block),
+        *OUTPUT,
+    ]
+    assert_agrees(model_of(nodes, constants, domains=["com.microsoft"]), tolerance=1e-4)
+
+
+def test_features_of_scikit_learn_pipelines() -> None:
+    nodes = [
+        node(
+            "Imputer", ["x"], ["i"], domain="ai.onnx.ml", imputed_value_floats=[0.0], replaced_value_float=float("nan")
+        ),
+        node("FeatureVectorizer", ["i", "i"], ["f"], domain="ai.onnx.ml", inputdimensions=[3, 3]),
+        node("Relu", ["f"], ["z"]),
+        *OUTPUT,
+    ]
+    assert_agrees(model_of(nodes, {"V": V}, domains=["ai.onnx.ml"]))
+
+
 def test_weight_norm_left_in_the_graph() -> None:
     nodes = [
         node("ReduceL2", ["direction"], ["norm"], axes=[0], keepdims=1),

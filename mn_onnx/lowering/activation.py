@@ -34,8 +34,8 @@ def simple(operation: str, fidelity: Fidelity = "surrogate", since: int = 1) -> 
 
 
 def number(node: Node, name: str, default: float) -> float:
-    """A float attribute."""
-    return float(node.attribute(name, default))
+    """A float attribute; attributes are stored in float32, and so are their defaults."""
+    return float(np.float32(node.attribute(name, default)))
 
 
 def slopes(context: Context, node: Node) -> Tensor:
@@ -54,7 +54,7 @@ def _leaky_with_constant(x: Expression, slope: Expression) -> Expression:
 
 def clip_by_attributes(context: Context, node: Node) -> Tensor:
     """Clip before opset 11."""
-    lowest, highest = number(node, "min", -math.inf), number(node, "max", math.inf)
+    lowest, highest = number(node, "min", -FLOAT32_MAX), number(node, "max", FLOAT32_MAX)
     return _clip(context, lift(node.tensor(0)), lowest, highest)
 
 
@@ -88,6 +88,16 @@ def gelu(node: Node, x: Expression) -> Expression:
     if approximate not in ("none", "tanh"):
         raise UnsupportedNode(f"approximate={approximate!r} is not defined; 'none' and 'tanh' are")
     return formulas.gelu_tanh(x) if approximate == "tanh" else formulas.gelu(x)
+
+
+def selu(alpha: float, gamma: float) -> Callable[[Context, Node], Tensor]:
+    """Selu with default parameters, which became longer in opset 6."""
+
+    def lower(context: Context, node: Node) -> Tensor:
+        chosen = number(node, "alpha", alpha), number(node, "gamma", gamma)
+        return context.algebra.unary(lift(node.tensor(0)), lambda x: formulas.selu(x, *chosen))
+
+    return lower
 
 
 def is_never(_context: Context, node: Node) -> Constant:
@@ -135,26 +145,8 @@ LOWERINGS: Table = {
     "IsInf": same(is_never, 10),
     "Elu": elementwise(lambda n, x: formulas.elu(x, number(n, "alpha", 1.0))),
     "Selu": [
-        Lowering(
-            1,
-            lambda c, n: c.algebra.unary(
-                lift(n.tensor(0)), lambda x: formulas.selu(x, number(n, "alpha", 1.6732), number(n, "gamma", 1.0507))
-            ),
-            "surrogate",
-        ),
-        Lowering(
-            6,
-            lambda c, n: c.algebra.unary(
-                lift(n.tensor(0)),
-                # The defaults of the specification are these numbers in float32.
-                lambda x: formulas.selu(
-                    x,
-                    number(n, "alpha", float(np.float32(1.67326319217681884765625))),
-                    number(n, "gamma", float(np.float32(1.05070102214813232421875))),
-                ),
-            ),
-            "surrogate",
-        ),
+        Lowering(1, selu(1.6732, 1.0507), "surrogate"),
+        Lowering(6, selu(1.67326319217681884765625, 1.05070102214813232421875), "surrogate"),
     ],
     "Celu": elementwise(lambda n, x: formulas.celu(x, number(n, "alpha", 1.0)), since=12),
     "Gelu": elementwise(gelu, since=20),

@@ -13,9 +13,9 @@ from mn_onnx.lowering.activation import elementwise, number
 from mn_onnx.lowering.context import Context
 from mn_onnx.lowering.indexing import indices_of, wrapped
 from mn_onnx.lowering.node import Node, UnsupportedNode
-from mn_onnx.lowering.quantised import dequantize
+from mn_onnx.lowering.quantised import dequantize, matmul_of_packed_weights
 from mn_onnx.lowering.table import Table, same
-from mn_onnx.symbolic import Constant, Tensor, lift, rearrange
+from mn_onnx.symbolic import Constant, Tensor, concatenate, lift, rearrange
 from mn_onnx.symbolic_linear import matmul
 
 FLOAT32 = np.dtype(np.float32)
@@ -128,6 +128,20 @@ def binarizer(context: Context, node: Node) -> Tensor:
     return context.algebra.unary(lift(node.tensor(0)), lambda x: formulas.truth_as_number(apply("less", threshold, x)))
 
 
+def imputer(_context: Context, node: Node) -> Constant | Tensor:
+    """Replaces missing values, which points do not have."""
+    missing = node.attribute("replaced_value_float", 0.0)
+    if not np.isnan(missing):
+        raise UnsupportedNode(f"it replaces the value {missing}, which is a jump", "mark missing values by NaN")
+    return node.tensor(0)
+
+
+def feature_vectorizer(_context: Context, node: Node) -> Constant | Tensor:
+    """The inputs side by side, as real numbers."""
+    parts = [lift(node.tensor(index)).with_dtype(FLOAT32) for index in range(len(node.inputs))]
+    return concatenate([part.reshape(part.shape[0], -1) for part in parts], 1)
+
+
 MICROSOFT: Table = {
     "FusedGemm": same(fused_gemm),
     "FusedConv": same(fused_convolution),
@@ -138,6 +152,7 @@ MICROSOFT: Table = {
     "FastGelu": same(biased(formulas.gelu_tanh), 1, "surrogate"),
     "QuickGelu": elementwise(lambda n, x: formulas.swish(x, number(n, "alpha", 1.702))),
     "DequantizeLinear": same(dequantize, on_constants=True),
+    "MatMulNBits": same(matmul_of_packed_weights),
 }
 
 MACHINE_LEARNING: Table = {
@@ -145,4 +160,6 @@ MACHINE_LEARNING: Table = {
     "LinearRegressor": same(linear_regressor),
     "ArrayFeatureExtractor": same(array_feature_extractor, on_constants=True),
     "Binarizer": same(binarizer),
+    "Imputer": same(imputer),
+    "FeatureVectorizer": same(feature_vectorizer),
 }

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
+
 from mn_onnx.ir.expression import Expression, apply, constant
 
 ZERO, ONE = constant(0.0), constant(1.0)
@@ -71,8 +73,8 @@ def hard_sigmoid(x: Expression, alpha: float, beta: float) -> Expression:
 
 
 def hard_swish(x: Expression) -> Expression:
-    """``x`` times `hard_sigmoid` with slope 1/6."""
-    return apply("multiply", x, hard_sigmoid(x, 1.0 / 6.0, 0.5))
+    """``x`` times `hard_sigmoid` with slope 1/6, an attribute in the specification and so a float32."""
+    return apply("multiply", x, hard_sigmoid(x, float(np.float32(1.0 / 6.0)), 0.5))
 
 
 def swish(x: Expression, rate: float) -> Expression:

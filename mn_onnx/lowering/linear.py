@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 
+from mn_onnx.lowering.activation import number
 from mn_onnx.lowering.context import Context
 from mn_onnx.lowering.node import Node, UnsupportedNode
 from mn_onnx.lowering.table import Lowering, Table, same
@@ -115,7 +116,7 @@ def batch_normalization(context: Context, node: Node) -> Tensor:
     x = lift(node.tensor(0))
     names = ("scale", "bias", "mean", "variance")
     scale, bias, mean, variance = (np.asarray(node.constant(i, name), np.float64) for i, name in enumerate(names, 1))
-    factor = scale / np.sqrt(variance + float(node.attribute("epsilon", 1e-5)))
+    factor = scale / np.sqrt(variance + number(node, "epsilon", 1e-5))
     shift = bias - mean * factor
     if not (np.isfinite(factor).all() and np.isfinite(shift).all()):
         raise UnsupportedNode("its stored statistics are not finite numbers")

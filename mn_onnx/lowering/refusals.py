@@ -75,7 +75,7 @@ REFUSALS: dict[tuple[str, str], Refusal] = {
         (
             "com.microsoft",
             Refusal("weights packed for onnxruntime are not supported", "export the network before this quantisation"),
-            "MatMulNBits MatMulFpQ4 MatMulBnb4",
+            "MatMulFpQ4 MatMulBnb4",
         ),
     )
     for operator in operators.split()
