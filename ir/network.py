@@ -44,7 +44,8 @@ class KnotTable:
 
     ``knots``: float64 [m], strictly increasing. On interval ``i`` (between knots ``i-1`` and ``i``) output ``k`` is
     ``slopes[k, i] * t + intercepts[k, i]``; ``slopes`` and ``intercepts`` are float64 [o, m + 1].
-    ``errors``: float64 [o, m + 1], a proved bound on ``|true - table|`` per output and interval; zero where exact.
+    ``errors``: float64 [o, m + 1], a proved bound on ``|true - table|`` per output and interval; zero where exact. It
+    holds for the arguments that occur on the box the network was canonicalised for.
     """
 
     knots: Floats

@@ -13,6 +13,7 @@ from mn_onnx.ir.expression import Expression
 from mn_onnx.ir.levels import level_blocks
 from mn_onnx.ir.network import AffineRow, Floats, KnotTable, Network, Unit
 from mn_onnx.ir.proportional import proportional_groups
+from mn_onnx.ir.scalar import simplify
 
 # Adjacent pieces of a table agree at their knot up to this many roundings of the largest term.
 CONTINUITY_ULPS = 8
@@ -89,8 +90,6 @@ def well_formed(network: Network) -> list[str]:
 
 def piecewise_linear_recognised(network: Network) -> list[str]:
     """No function that is exactly piecewise linear is left as an expression."""
-    from mn_onnx.ir.scalar import simplify
-
     return [
         f"{unit.name}: a piecewise-linear function is still an expression"
         for unit in network.units

@@ -56,12 +56,3 @@ def combine(table: KnotTable, weights: Floats, bias: float) -> KnotTable:
         (weights @ table.intercepts + bias)[None, :],
         (np.abs(weights) @ table.errors)[None, :],
     )
-
-
-def drop_idle_knots(table: KnotTable) -> KnotTable:
-    """The table without knots at which no output changes."""
-    kept = ((np.diff(table.slopes, axis=1) != 0) | (np.diff(table.errors, axis=1) != 0)).any(axis=0)
-    intervals = np.concatenate([[True], kept])
-    return KnotTable(
-        table.knots[kept], table.slopes[:, intervals], table.intercepts[:, intervals], table.errors[:, intervals]
-    )

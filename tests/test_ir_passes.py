@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from dataclasses import replace
 
 import numpy as np
@@ -24,6 +25,7 @@ from ir_networks import (
     dense,
     networks,
     random_points,
+    scalar_values,
     softplus,
     unit_box,
 )  # fmt: skip
@@ -239,8 +241,6 @@ def test_unused_units_and_outputs_are_removed() -> None:
 @pytest.mark.parametrize(("scale", "offset"), [(2.0, 0.3), (-0.7, 1.1)])
 @pytest.mark.parametrize("function", [STAIRS, RELU, ELU, SILU])
 def test_change_of_variable(function, scale: float, offset: float) -> None:
-    from ir_networks import scalar_values
-
     s = np.linspace(-3, 3, 301)
     np.testing.assert_allclose(
         scalar_values(in_terms_of(function, scale, offset), s), scalar_values(function, scale * s + offset), atol=1e-14
@@ -313,8 +313,6 @@ def test_every_canonical_property_is_checked() -> None:
 
 
 def test_wide_networks_are_canonicalised_in_about_a_second() -> None:
-    import time
-
     network = dense([512] * 4)
     started = time.process_time()
     result = canonical(network)

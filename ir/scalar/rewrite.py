@@ -15,7 +15,6 @@ import numpy as np
 from mn_onnx.ir.expression import Expression, apply, constant
 from mn_onnx.ir.scalar.functions import FUNCTIONS
 
-ZERO, ONE = constant(0.0), constant(1.0)
 # The defaults of ONNX's Clip: a bound of this size means "no bound".
 NO_BOUND = float(np.finfo(np.float32).max)
 
