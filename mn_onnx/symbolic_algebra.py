@@ -10,11 +10,9 @@ import numpy as np
 
 from mn_onnx.ir.expression import apply, constant
 from mn_onnx.symbolic import CONSTANT, IDENTITY, Tensor, check_size, join
-from mn_onnx.symbolic_compose import Builder, Composer
+from mn_onnx.symbolic_compose import BOOL, Builder, Composer
 from mn_onnx.symbolic_elements import Mask, assign, copy, drop_zero_scales
 from mn_onnx.symbolic_store import Rows
-
-BOOL = np.dtype(bool)
 
 
 class Algebra(Composer):
@@ -190,7 +188,7 @@ class Algebra(Composer):
         """``x`` where ``condition`` holds, else ``y``."""
         shape = np.broadcast_shapes(condition.shape, x.shape, y.shape)
         check_size(shape)
-        c, a, b = (part.broadcast(shape).reshape(-1) for part in (condition, x, y))
+        c, a, b = (self._cut_large(part).broadcast(shape).reshape(-1) for part in (condition, x, y))
         known = c.base == CONSTANT
         result = copy(b)
         assign(result, known & (c.offset != 0.0), a)

@@ -15,6 +15,7 @@ from mn_onnx.symbolic_store import Store
 
 Builder = Callable[..., Expression]
 
+BOOL = np.dtype(bool)
 STEP_RANGE = 64.0
 """Jumps of a function are looked for on ``[-STEP_RANGE, STEP_RANGE]``; further out the range of its unit decides."""
 
@@ -40,7 +41,7 @@ class Composer:
         """``build`` of elements that depend on the point through one direction at most; else refused."""
         shape = np.broadcast_shapes(*(operand.shape for operand in operands))
         check_size(shape)
-        flat = [operand.broadcast(shape).reshape(-1) for operand in operands]
+        flat = [self._cut_large(operand).broadcast(shape).reshape(-1) for operand in operands]
         related = np.ones(flat[0].size, np.bool_)
         for i, first in enumerate(flat):
             for second in flat[i + 1 :]:
@@ -54,7 +55,6 @@ class Composer:
 
     def _compose(self, operands: list[Tensor], build: Builder, where: Mask | None = None) -> Tensor:
         """``build`` over flat operands whose live elements share a direction, element by element."""
-        operands = [self._cut_large(operand) for operand in operands]
         n = operands[0].size
         base = np.full(n, CONSTANT, np.int64)
         for operand in reversed(operands):
@@ -99,14 +99,21 @@ class Composer:
         return affine(outer, float(operand.scale[i]), float(operand.offset[i]))
 
     def _cut_large(self, x: Tensor) -> Tensor:
-        """Make units of functions that have grown too long to be composed further."""
-        large = [i for i in np.flatnonzero(x.live).tolist() if self.store.is_large(int(x.function[i]))]
-        if not large:
+        """Make units of functions that have grown too long to be composed further.
+
+        This must come before operands are compared, as it changes the direction of an element.
+        """
+        functions = np.unique(x.function[x.live])
+        large = (
+            functions[[self.store.is_large(number) for number in functions.tolist()]] if functions.size else functions
+        )
+        # Truth values cannot be units; they only grow by logic.
+        if not large.size or x.dtype == BOOL:
             return x
-        result = copy(x)
-        for i in large:
-            variable = self.store.unit(int(x.base[i]), int(x.function[i]), self.node)
-            result.base[i], result.function[i] = self.store.variable_base(variable), IDENTITY
+        result = copy(self.settle(x))
+        for i in np.flatnonzero(result.live & np.isin(result.function, large)).tolist():
+            variable = self.store.unit(int(x.base.flat[i]), int(x.function.flat[i]), self.node)
+            result.base.flat[i], result.function.flat[i] = self.store.variable_base(variable), IDENTITY
         return result
 
     def settle(self, x: Tensor) -> Tensor:
@@ -152,7 +159,7 @@ class Composer:
     def _binary(self, x: Tensor, y: Tensor, compute: Callable[[Tensor, Tensor], Tensor]) -> Tensor:
         shape = np.broadcast_shapes(x.shape, y.shape)
         check_size(shape)
-        flat = [x.broadcast(shape).reshape(-1), y.broadcast(shape).reshape(-1)]
+        flat = [self._cut_large(operand).broadcast(shape).reshape(-1) for operand in (x, y)]
         return self._elementwise(flat, compute).reshape(*shape).with_dtype(x.dtype)
 
     def _elementwise(

@@ -15,7 +15,7 @@ Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
 STEPS = frozenset({"sign", "floor", "ceil", "round", "less", "less_equal", "equal"})
-EXPRESSION_LIMIT = 256
+EXPRESSION_LIMIT = 128
 """Most operations of one scalar function; larger ones are cut by making the inner function a unit of its own."""
 
 

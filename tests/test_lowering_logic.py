@@ -6,7 +6,7 @@ import numpy as np
 import onnx
 import pytest
 from onnx import TensorProto
-from onnx_models import assert_agrees, float32, model_of, node
+from onnx_models import assert_agrees, float32, int64, model_of, node
 
 from mn_onnx.errors import ModelRefused
 from mn_onnx.importer import import_network
@@ -179,3 +179,29 @@ def test_units_carry_the_names_of_their_nodes() -> None:
     names = [unit.name for unit in assert_agrees(network(*nodes)).network.units]
     assert names[:2] == ["/net/act[0]", "/net/act[1]"]
     assert all(name.startswith(("/net/act[", "/net/max[")) for name in names)
+
+
+@pytest.mark.parametrize("op", ["Mul", "Add"])
+def test_long_chains_of_one_number_stay_small(op: str) -> None:
+    """Every step doubles the expression; long ones are cut by units, so that the import does not explode."""
+    nodes = []
+    name = "p"
+    for i in range(24):
+        nodes.append(node("Sigmoid", [name], [f"s{i}"]))
+        nodes.append(node(op, [name, f"s{i}"], [f"t{i}"]))
+        nodes.append(node("Clip", [f"t{i}", "low", "high"], [f"u{i}"]))
+        name = f"u{i}"
+    nodes.append(node("Identity", [name], ["h"]))
+    imported = assert_agrees(network(*nodes, low=-3.0, high=3.0))
+    assert 4 < len(imported.network.units) < 400
+
+
+def test_chains_through_narrow_layers_stay_small() -> None:
+    nodes = [node("ReduceSum", ["p", "axes"], ["r0"], keepdims=1)]
+    for i in range(20):
+        nodes.append(node("Tanh", [f"r{i}"], [f"s{i}"]))
+        nodes.append(node("Mul", [f"s{i}", f"r{i}"], [f"m{i}"]))
+        nodes.append(node("MatMul", [f"m{i}", "narrow"], [f"r{i + 1}"]))
+    nodes.append(node("Expand", ["r20", "shape"], ["h"]))
+    constants = WEIGHTS | {"axes": int64(1), "narrow": np.array([[1.7]], np.float32), "shape": int64(1, 4)}
+    assert_agrees(model_of([*LAYERS, *nodes, node("MatMul", ["h", "v"], ["y"])], constants))
