@@ -13,8 +13,11 @@ from mn_onnx.ir.network import Network
 
 Floats = NDArray[np.float64]
 
-N_SAMPLES = 1024
-"""Points of the box, and polygons of the surface, that are looked at."""
+N_INSIDE = 4096
+"""Random points of the box that are looked at."""
+
+N_BESIDE = 1024
+"""Polygons of the surface beside which is looked."""
 
 STEP = 1e-6
 """How far from its polygon a point beside the surface lies, relative to the box."""
@@ -45,14 +48,14 @@ def find_flat_regions(network: Network, lower: Floats, upper: Floats, surface: S
     """
     generator = np.random.default_rng(0)
     evaluator = Evaluator(network)
-    inside = generator.uniform(lower, upper, (N_SAMPLES, network.input_dim))
+    inside = generator.uniform(lower, upper, (N_INSIDE, network.input_dim))
     values = evaluator.values(inside)
     size = float((upper - lower).max())
     largest = float(np.abs(values).max()) or 1.0
     share = _flat_share(evaluator, inside, values, largest, size)
     if not surface.n_polygons:
         return FlatRegions(share)
-    polygons = np.linspace(0, surface.n_polygons - 1, min(N_SAMPLES, surface.n_polygons)).astype(np.int64)
+    polygons = np.linspace(0, surface.n_polygons - 1, min(N_BESIDE, surface.n_polygons)).astype(np.int64)
     beside = _centres(surface, polygons) + STEP * size * surface.normals[polygons]
     return FlatRegions(share, _flat_share(evaluator, beside, evaluator.values(beside), largest, size))
 

@@ -121,11 +121,18 @@ def extract_surface(
     with run.phase("weld"):
         surface, degeneracy = _as_it_is(soup, run)
         del soup
+    flat_regions = FlatRegions()
+    if not degeneracy.found:
+        with run.phase("flat"):
+            flat_regions = find_flat_regions(network, run.lower, run.upper, surface)
+        if flat_regions:
+            # A surface that borders on zeros lies in a plane where pieces of f meet: rounding may lose all of it.
+            degeneracy = replace(degeneracy, found=("f is zero throughout a part of the box",))
     if degeneracy.found:
         with run.phase("perturb"):
             surface, degeneracy = _in_the_limit(network, run, surface, degeneracy)
-    with run.phase("flat"):
-        flat_regions = find_flat_regions(network, run.lower, run.upper, surface)
+        with run.phase("flat"):
+            flat_regions = find_flat_regions(network, run.lower, run.upper, surface)
     return Extraction(surface, statistics, degeneracy, flat_regions, run.seconds)
 
 
