@@ -42,6 +42,20 @@ def contract_short_edges(surface: Surface, length: float) -> tuple[Surface, Cont
     vertices stand where the first of them stood. The order of the remaining polygons does not change, vertices are
     numbered by their first corner.
     """
+    total = Contraction(0, 0, 0)
+    while True:
+        surface, step = _contract_once(surface, length)
+        total = Contraction(
+            total.merged_vertices + step.merged_vertices,
+            total.removed_polygons + step.removed_polygons,
+            step.kept_polygons,
+        )
+        # A removed polygon may leave an edge between vertices that coincide but had none before.
+        if not step.removed_polygons:
+            return surface, total
+
+
+def _contract_once(surface: Surface, length: float) -> tuple[Surface, Contraction]:
     heads = half_edge_heads(surface.offsets, surface.corners)
     steps = surface.vertices[heads] - surface.vertices[surface.corners]
     short = np.einsum("ij,ij->i", steps, steps) <= length * length

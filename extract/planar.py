@@ -90,7 +90,8 @@ def extract_roots(
     slab = extract_surface(wide, low, high, threads=threads, progress=progress, on_phase=on_phase)
     surface = slab.surface
     positions = surface.vertices[surface.corners[surface.offsets[:-1]], 0]
-    order = np.argsort(positions, kind="stable")
+    # Where f only touches zero from below it rises to it first, and falls then.
+    order = np.lexsort((-surface.gradients[:, 0], positions))
     slopes, errors = surface.gradients[order, 0], surface.errors[order]
     return RootExtraction(Roots(positions[order], slopes, errors, float(low[0]), float(high[0])), slab)
 

@@ -6,9 +6,12 @@ import numpy as np
 import pytest
 
 from mn_onnx.extract.invariants import check_invariants
+from mn_onnx.extract.pipeline import extract_surface
 from mn_onnx.extract.weld import weld
+from mn_onnx.ir.evaluate import evaluate
 from oracle.corpus import CORPUS, Case
 from oracle.level_set import exact_level_set
+from oracle.point_sets import exact_counts, point_set_counts
 from oracle.sketch import as_network
 from oracle.soups import as_soup
 
@@ -48,3 +51,22 @@ def test_welding_the_exact_polygons_gives_the_surface_of_the_table(case: Case) -
     if exact.facets and not case.open_faces:
         assert invariants.volume == pytest.approx(case.volume, abs=1e-12)
     assert invariants.boundary_edges == len(exact.boundary_edges)
+
+
+@pytest.mark.parametrize("case", CORPUS, ids=str)
+def test_extraction_gives_the_surface_of_the_table(case: Case) -> None:
+    network = as_network(case.body)
+    extraction = extract_surface(network, *(np.array(corner) for corner in case.bounds))
+    surface = extraction.surface
+    invariants = check_invariants(surface, bounds=np.array(case.bounds).T)
+    assert invariants.problems() == []
+    assert invariants.degenerate_polygons == invariants.polygons_with_zero_edges == 0
+    assert point_set_counts(surface) == exact_counts(exact_level_set(network, *case.bounds))
+    assert invariants.euler == case.euler
+    assert len(invariants.components) == case.components
+    assert invariants.area == pytest.approx(case.area, abs=1e-12)
+    if surface.n_polygons and not case.open_faces:
+        assert invariants.volume == pytest.approx(case.volume, abs=1e-12)
+    assert set(np.unique(surface.box_faces[surface.boundary])) <= case.open_faces
+    assert bool(extraction.flat_regions) == case.has_flat_regions
+    assert np.abs(evaluate(network, surface.vertices)).max(initial=0.0) < 1e-14
