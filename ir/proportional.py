@@ -18,24 +18,27 @@ def pivots(weights: Floats) -> Integers:
 
 
 def proportional_groups(weights: Floats) -> list[list[int]]:
-    """The rows of ``weights`` (float64 [r, c], none zero) grouped by direction, sign ignored.
+    """The rows of ``weights`` (float64 [r, c]) grouped by direction, sign ignored.
 
     Groups are in the order of their first rows, and so are the members. Rows that are nearly but not exactly
-    proportional stay apart.
+    proportional stay apart, and so do rows of zeros, which have no direction.
     """
+    is_zero = ~weights.any(axis=1)
+    if is_zero.any():
+        directed = np.flatnonzero(~is_zero)
+        groups = [directed[group].tolist() for group in proportional_groups(weights[directed])] if directed.size else []
+        return sorted([*groups, *([row] for row in np.flatnonzero(is_zero).tolist())])
     rows = weights.shape[0]
-    if not weights.size:
-        return [[row] for row in range(rows)]
     normalised = weights / weights[np.arange(rows), pivots(weights)][:, None]
     # Equal rows have equal projections, so only neighbours in their order need to be compared.
     direction = np.cos(1.0 + np.arange(weights.shape[1]) ** 2)
     projection = normalised @ direction
     order = np.argsort(projection, kind="stable")
     slack = 4 * weights.shape[1] * TOLERANCE
-    groups: list[list[int]] = []
+    found: list[list[int]] = []
     for run in np.split(order, np.flatnonzero(np.diff(projection[order]) > slack) + 1):
-        groups.extend(_split_run(normalised, sorted(run.tolist())))
-    return sorted(groups)
+        found.extend(_split_run(normalised, sorted(run.tolist())))
+    return sorted(found)
 
 
 def _split_run(normalised: Floats, run: list[int]) -> list[list[int]]:

@@ -191,6 +191,28 @@ def test_opposite_and_shifted_units_share_a_unit() -> None:
     np.testing.assert_allclose(evaluate(result.network, points), evaluate(network, points), atol=1e-14)
 
 
+def test_duplicates_that_cancel_leave_a_constant() -> None:
+    """A deeper row over the difference of two equal units reads nothing."""
+    row = AffineRow(np.array([0, 1]), np.array([1.0, 2.0]), 0.5)
+    units = [Unit(row, (RELU,), f"twin{i}") for i in range(2)]
+    units += [Unit(AffineRow(np.array([2, 3]), np.array([1.0, -1.0]), 0.75), (TANH,), "nothing")]
+    network = Network(2, tuple(units), AffineRow(np.array([1, 2, 4]), np.array([1.0, -1.0, 2.0]), 0.0))
+    result = canonical(network)
+    assert [unit.name for unit in result.network.units] == ["twin0 (+1)"]
+    assert result.network.output.bias == pytest.approx(2 * np.tanh(0.75))
+
+
+def test_a_head_spelled_with_two_units_is_stripped() -> None:
+    """``relu(t) - 0.1 relu(-t)`` is a leaky ReLU."""
+    inner = dense([6], seed=3)
+    opposite = AffineRow(inner.output.columns, -inner.output.weights, -inner.output.bias)
+    units = (*inner.units, Unit(inner.output, (RELU,), "plus"), Unit(opposite, (RELU,), "minus"))
+    output = AffineRow(np.array([inner.n_variables, inner.n_variables + 1]), np.array([1.0, -0.1]), 0.0)
+    result = canonical(replace(inner, units=units, output=output), level=0.02)
+    assert len(result.network.units) == 6
+    assert result.network.output.bias == pytest.approx(inner.output.bias - 0.02)
+
+
 def test_nearly_proportional_rows_stay_apart() -> None:
     rows = [AffineRow(np.array([0, 1]), np.array([1.0, 1.0 + shift]), 0.1) for shift in (0.0, 1e-9)]
     units = tuple(Unit(row, (RELU,), f"unit{i}") for i, row in enumerate(rows))

@@ -27,10 +27,11 @@ from mn_onnx.ir.spec import CANONICAL, IMPORTED, verify
 LOWERING: tuple[Pass, ...] = (
     RECOGNISE,
     FUSE_AFFINE,
-    STRIP_HEADS,
+    MERGE_PROPORTIONAL,
+    FUSE_AFFINE,  # rows over merged duplicates may have cancelled
+    STRIP_HEADS,  # a head spelled with several units is one unit now
     SUBTRACT_LEVEL,
     REMOVE_UNUSED,
-    MERGE_PROPORTIONAL,
 )
 # ... and all of it. Refinement repeats the last pass.
 PASSES: tuple[Pass, ...] = (*LOWERING, TABULATE)

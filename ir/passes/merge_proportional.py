@@ -82,10 +82,12 @@ class _Merger:
         columns = used_columns(rows)
         weights = dense_rows(rows, columns)
         bias = np.array([row.bias for row in rows], np.float64)
-        pivot = pivots(weights)
         for group in proportional_groups(weights):
             first = group[0]
-            scales = weights[group, pivot[first]] / weights[first, pivot[first]]
+            scales = np.ones(1)
+            if len(group) > 1:
+                at_pivot = weights[group, pivots(weights[[first]])[0]]
+                scales = at_pivot / at_pivot[0]
             offsets = bias[group] - scales * bias[first]
             noise = OFFSET_ULPS * np.finfo(np.float64).eps * (np.abs(bias[group]) + np.abs(scales * bias[first]))
             offsets[np.abs(offsets) <= noise] = 0.0
