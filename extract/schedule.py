@@ -62,7 +62,7 @@ class Progress:
 
     nodes: int
     polygons: int
-    fraction: float
+    corners: int
 
 
 @dataclass
@@ -100,7 +100,7 @@ class _Worker:
         self.slot_of_tag = np.zeros(packed.tables.tag_hash.shape[0], np.int64)
         self._set_scratch(max(512, -(-largest // 4) * 4))
         self._set_output(BUFFER_CORNERS // 4, BUFFER_CORNERS)
-        self.polygons = 0
+        self.polygons = self.corners = 0
 
     def _set_scratch(self, region: int) -> None:
         self.X = np.zeros(X_REGIONS * region)
@@ -149,6 +149,7 @@ class _Worker:
                 )
             )
             self.polygons += polygons
+            self.corners += corners
             out.counts[:] = 0
 
     def run(self, task: _Task, budget: int) -> bool:
@@ -275,7 +276,9 @@ def traverse(
             next(thread for thread in crew if thread.is_alive()).join(0.2)
             if progress is not None:
                 nodes = sum(int(worker.control[kernel.NODES]) for worker in workers)
-                progress(Progress(nodes, sum(w.polygons + int(w.output.counts[0]) for w in workers), 0.0))
+                polygons = sum(worker.polygons + int(worker.output.counts[0]) for worker in workers)
+                corners = sum(worker.corners + int(worker.output.counts[1]) for worker in workers)
+                progress(Progress(nodes, polygons, corners))
     finally:
         for worker in workers:
             worker.control[kernel.STOP] = 1
@@ -300,7 +303,7 @@ def _statistics(workers: list[_Worker], pool: _Pool) -> TraversalStatistics:
         deepest=max(int(worker.control[kernel.DEEPEST]) for worker in workers),
         subtrees=pool.subtrees,
         threads=len(workers),
-        profile=sum(w.control[kernel.PROFILE :] for w in workers).reshape(2, -1),
+        profile=np.sum([worker.control[kernel.PROFILE :] for worker in workers], axis=0).reshape(2, -1),
     )
 
 

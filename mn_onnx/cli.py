@@ -1,6 +1,7 @@
 """The command line: arguments, exit codes, and nothing else, so that it starts fast. `mn_onnx.commands` does the work.
 
-Exit codes: 0 success; 2 wrong usage or a refused model; 3 a check failed or there is no level set; 130 interrupted.
+Exit codes: 0 success; 2 wrong usage or a refused model; 3 a check failed or there is no level set; 4 the memory allowed
+is not enough; 130 interrupted.
 """
 
 from __future__ import annotations
@@ -10,10 +11,11 @@ import sys
 from collections.abc import Sequence
 
 from mn_onnx import __version__
-from mn_onnx.errors import CheckFailed, MnOnnxError
+from mn_onnx.errors import CheckFailed, MemoryLimitReached, MnOnnxError
 
 EXIT_USAGE = 2
 EXIT_CHECK = 3
+EXIT_MEMORY = 4
 EXIT_INTERRUPTED = 130
 
 
@@ -26,6 +28,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except CheckFailed as error:
         _complain(str(error))
         return EXIT_CHECK
+    except MemoryLimitReached as error:
+        _complain(str(error))
+        return EXIT_MEMORY
     except MnOnnxError as error:
         _complain(str(error))
         return EXIT_USAGE
@@ -52,6 +57,12 @@ def _verify(options: argparse.Namespace) -> int:
     return run_verify(options)
 
 
+def _bench(options: argparse.Namespace) -> int:
+    from mn_onnx.commands import run_bench
+
+    return run_bench(options)
+
+
 def _complain(message: str) -> None:
     print(f"mn-onnx: {message}", file=sys.stderr)
 
@@ -61,13 +72,15 @@ def build_parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="mn-onnx",
         description="Exact level sets of networks exported to ONNX, as welded polygon meshes.",
-        epilog="Exit codes: 0 ok, 2 wrong usage or refused model, 3 failed check or empty level set, 130 interrupted.",
+        epilog="Exit codes: 0 ok, 2 wrong usage or refused model, 3 failed check or empty level set, 4 memory limit "
+        "reached, 130 interrupted.",
     )
     parser.add_argument("--version", action="version", version=f"mn-onnx {__version__}")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
     _add_extract(commands)
     _add_inspect(commands)
     _add_verify(commands)
+    _add_bench(commands)
     return parser
 
 
@@ -87,8 +100,10 @@ def _add_extract(commands: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser.add_argument("--float64", action="store_true", help="write coordinates in double precision (.ply)")
     parser.add_argument("--report", metavar="FILE.json", help="write counts, checks, times and versions as JSON")
     parser.add_argument("--no-check", action="store_true", help="write the mesh without checks against onnxruntime")
+    parser.add_argument("--profile", action="store_true", help="print where the time went, on standard error")
     parser.add_argument("--quiet", action="store_true", help="print nothing but errors")
     _add_threads(parser)
+    _add_max_memory(parser)
 
 
 def _add_inspect(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -125,8 +140,39 @@ def _add_verify(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -
     _add_threads(parser)
 
 
+def _add_bench(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+    parser = commands.add_parser(
+        "bench",
+        help="measure exact extraction against marching cubes on this machine",
+        description="Time, memory and error of exact extraction and of marching cubes (onnxruntime, scikit-image), on "
+        "the same threads, each in a fresh process, kernels warm. Needs the extra `bench`.",
+    )
+    parser.set_defaults(run=_bench)
+    parser.add_argument("models", metavar="MODEL", nargs="+", help="ONNX files")
+    parser.add_argument(
+        "--grids", type=int, nargs="+", metavar="N", help="points per axis of marching cubes (default 64 128 256)"
+    )
+    parser.add_argument(
+        "--repeat", type=int, default=3, metavar="N", help="runs, of which the median counts (default 3)"
+    )
+    parser.add_argument(
+        "--samples", type=int, default=1 << 20, metavar="N", help="points per mesh to measure |f| at (default 2^20)"
+    )
+    parser.add_argument("--reference", metavar="MESH", help="true shape: measure its mean distance from each mesh too")
+    parser.add_argument("--json", metavar="FILE.json", help="write all measurements as JSON")
+    parser.add_argument("--plot", metavar="FILE.png", help="draw time against error")
+    parser.add_argument("--quiet", action="store_true", help="print no table")
+    _add_field(parser)
+    _add_threads(parser)
+    _add_max_memory(parser)
+
+
 def _add_model(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("model", metavar="MODEL", help="ONNX file")
+    _add_field(parser)
+
+
+def _add_field(parser: argparse.ArgumentParser) -> None:
     field = parser.add_argument_group("the field")
     field.add_argument("--level", type=float, default=0.0, metavar="L", help="value of the level set (default 0)")
     field.add_argument(
@@ -156,3 +202,11 @@ def _add_model(parser: argparse.ArgumentParser) -> None:
 
 def _add_threads(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--threads", type=int, metavar="N", help="threads to use (default: all cores)")
+
+
+def _add_max_memory(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--max-memory",
+        metavar="SIZE",
+        help="stop with an error before the process occupies more, such as 4GiB (default: 80 %% of what is available)",
+    )

@@ -12,6 +12,7 @@ from typing import Any
 
 from mn_onnx import options as parse
 from mn_onnx.errors import CheckFailed, ModelRefused, UsageError
+from mn_onnx.memory import parse_size
 from mn_onnx.model import LoadOptions, load
 
 
@@ -22,6 +23,7 @@ def run_extract(options: argparse.Namespace) -> int:
     """
     from mn_onnx.extract.files import MeshFileError, check_mesh_options, write_mesh
     from mn_onnx.extraction import extract
+    from mn_onnx.profile import profile_text
     from mn_onnx.progress import ProgressEvent, TerminalProgress
 
     try:
@@ -29,12 +31,18 @@ def run_extract(options: argparse.Namespace) -> int:
     except MeshFileError as error:
         raise UsageError(str(error)) from error
     if options.report is not None:
-        _check_report_path(Path(options.report))
+        _check_parent("--report", Path(options.report))
     with TerminalProgress(enabled=not options.quiet) as progress:
         progress(ProgressEvent("import"))
         model = load(options.model, **_load_options(options))
         try:
-            surface = extract(model, threads=options.threads, check=not options.no_check, progress=progress)
+            surface = extract(
+                model,
+                threads=options.threads,
+                check=not options.no_check,
+                max_memory=_max_memory(options),
+                progress=progress,
+            )
         except CheckFailed as error:
             if error.surface is not None:
                 _write_report(options.report, error.surface.report)
@@ -53,6 +61,8 @@ def run_extract(options: argparse.Namespace) -> int:
     _write_report(options.report, report)
     for problem in report["problems"]:
         print(f"mn-onnx: warning: {problem}", file=sys.stderr)
+    if options.profile:
+        print(profile_text(report), file=sys.stderr)
     if not options.quiet:
         print(_summary(options.mesh, report))
     return 0
@@ -97,6 +107,48 @@ def run_verify(options: argparse.Namespace) -> int:
     return 0
 
 
+def run_bench(options: argparse.Namespace) -> int:
+    """``mn-onnx bench``: print and write measurements; returns 0, or raises `CheckFailed` if some could not be made."""
+    from rich.console import Console
+
+    from mn_onnx.bench import BenchOptions, run_bench
+    from mn_onnx.bench.extras import PLOTTING, require
+    from mn_onnx.bench.plot import check_picture, plot
+    from mn_onnx.bench.run import GRIDS
+    from mn_onnx.bench.table import print_result
+
+    if options.json is not None:
+        _check_parent("--json", Path(options.json))
+    if options.plot is not None:
+        require(PLOTTING)
+        _check_parent("--plot", Path(options.plot))
+        check_picture(options.plot)
+    settings = BenchOptions(
+        grids=GRIDS if options.grids is None else options.grids,
+        threads=options.threads,
+        repeat=options.repeat,
+        samples=options.samples,
+        reference=options.reference,
+        max_memory=_max_memory(options),
+        load=_load_options(options),
+    )
+    with Console(stderr=True, quiet=options.quiet).status("start") as status:
+        result = run_bench(options.models, settings, on_start=status.update)
+    _write_report(options.json, result.as_dict())
+    if options.plot is not None:
+        plot(result, options.plot)
+    if not options.quiet:
+        print_result(result, Console())
+    failures = [f"{model.model}: {failure}" for model in result.models for failure in model.failures]
+    if failures:
+        raise CheckFailed(failures)
+    return 0
+
+
+def _max_memory(options: argparse.Namespace) -> int | None:
+    return None if options.max_memory is None else parse_size(options.max_memory)
+
+
 def _load_options(options: argparse.Namespace) -> LoadOptions:
     return {
         "output": options.output,
@@ -109,11 +161,11 @@ def _load_options(options: argparse.Namespace) -> LoadOptions:
     }
 
 
-def _check_report_path(path: Path) -> None:
+def _check_parent(option: str, path: Path) -> None:
     if path.is_dir():
-        raise UsageError(f"--report {path}: this is a folder")
+        raise UsageError(f"{option} {path}: this is a folder")
     if not path.absolute().parent.is_dir():
-        raise UsageError(f"--report {path}: the folder {path.absolute().parent} does not exist")
+        raise UsageError(f"{option} {path}: the folder {path.absolute().parent} does not exist")
 
 
 def _write_report(target: str | None, report: Any) -> None:

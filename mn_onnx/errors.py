@@ -18,10 +18,14 @@ class UsageError(MnOnnxError):
     """An argument, option or path is wrong."""
 
 
+class MemoryLimitReached(MnOnnxError):
+    """The extraction needs more memory than it was allowed; nothing was written."""
+
+
 class CheckFailed(MnOnnxError):
     """A result contradicts its checks: parity with onnxruntime, or the invariants of the mesh.
 
-    ``problems``: every failed check, a sentence each. ``surface``: the mesh that failed, with its report, if there is one.
+    ``problems``: every failed check, a sentence each. ``surface``: the mesh that failed, with its report, if any.
     """
 
     def __init__(self, problems: Sequence[str], surface: Surface | None = None) -> None:
@@ -36,7 +40,7 @@ class Problem:
 
     ``node``: name of the ONNX node, tensor or input concerned (empty: the whole model); ``op``: its operator, with the
     domain unless it is the standard one (empty if ``node`` is not a node); ``opset``: the version of that domain that
-    the model imports (0 if unknown); ``reason``: what was found and what is supported; ``remedy``: what the user can do.
+    the model imports (0 if unknown); ``reason``: what was found and what is supported; ``remedy``: what users can do.
     """
 
     node: str

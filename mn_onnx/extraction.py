@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 
 from mn_onnx.errors import CheckFailed, UsageError
 from mn_onnx.extract.invariants import Invariants, check_invariants
-from mn_onnx.extract.schedule import Progress, TraversalStatistics, traverse
-from mn_onnx.extract.soup import PolygonSoup
+from mn_onnx.extract.pipeline import Extraction, extract_surface
+from mn_onnx.extract.schedule import Progress
 from mn_onnx.extract.surface import Surface
-from mn_onnx.extract.weld import weld
+from mn_onnx.memory import MemoryLimit
 from mn_onnx.model import LoadOptions, Model, load
 from mn_onnx.parity import Parity, check_parity
 from mn_onnx.progress import ProgressCallback, ProgressEvent
@@ -51,6 +51,7 @@ def extract(
     *,
     threads: int | None = None,
     check: bool = True,
+    max_memory: int | None = None,
     progress: ProgressCallback | None = None,
     **options: Unpack[LoadOptions],
 ) -> Surface:
@@ -58,13 +59,14 @@ def extract(
 
     ``source``: a `Model` from `load`, or what `load` takes (path, bytes or message), with ``options`` as there.
     ``threads``: all cores by default; the mesh does not depend on it. ``check``: compare the imported network with
-    onnxruntime before, and measure the mesh after. ``progress``: called with a `ProgressEvent` a few times a second.
+    onnxruntime before, and measure the mesh after. ``max_memory``: most bytes that the process may occupy, by default
+    what it has and 80 % of what is available. ``progress``: called with a `ProgressEvent` a few times a second.
 
     Returns a `Surface`: ``vertices`` float64 [v, 3], polygons oriented towards growing f, and ``report``, whose keys
     `mn_onnx.report` lists. An empty level set is a surface without polygons.
 
     Raises `UsageError` and `ModelRefused` as `load`; `CheckFailed` with every failed check (``error.surface`` is the
-    mesh, if there is one already).
+    mesh, if there is one already); `MemoryLimitReached` if the mesh would not fit in ``max_memory``.
     """
     phases = _Phases(progress)
     if isinstance(source, Model):
@@ -76,6 +78,7 @@ def extract(
         model = load(source, **options)
     if threads is not None and threads < 1:
         raise UsageError(f"threads must be at least 1, not {threads}")
+    limit = MemoryLimit.of(max_memory)
     phases.seconds.update(model.seconds)
 
     runtime = parity = residuals = None
@@ -87,25 +90,25 @@ def extract(
                 raise CheckFailed(parity.problems())
     with phases.phase("compile"):
         warm_up(model.dimension)
-    with phases.phase("traverse"):
-        if model.canonical.empty_reason:
-            soup, statistics = empty_soup(model.dimension), TraversalStatistics()
-        else:
-            soup, statistics = traverse(
-                model.network, model.lower, model.upper, threads=threads, progress=_traversal_listener(phases)
-            )
-    with phases.phase("weld"):
-        surface = weld(soup, threads=threads)
-        del soup
+    found = extract_surface(
+        model.network,
+        model.lower,
+        model.upper,
+        threads=threads,
+        progress=_traversal_listener(phases, limit),
+        on_phase=lambda name: phases.announce(ProgressEvent(name)),
+    )
+    phases.seconds.update(found.seconds)
+    surface = found.surface
     with phases.phase("check"):
         invariants = check_invariants(surface, bounds=model.bounds)
         if check and surface.n_polygons and invariants.area > 0:
             residuals = measure_residuals(model, surface, runtime)
-    problems, notes = findings(model, invariants, parity, residuals, statistics)
+    problems, notes = findings(model, found, invariants, parity, residuals)
     report = build_report(
         model,
+        found,
         invariants=invariants,
-        statistics=statistics,
         parity=parity,
         residuals=residuals,
         seconds=phases.seconds,
@@ -118,11 +121,9 @@ def extract(
     return surface
 
 
-def _traversal_listener(phases: _Phases) -> Callable[[Progress], None] | None:
-    if phases.listener is None:
-        return None
-
+def _traversal_listener(phases: _Phases, limit: MemoryLimit) -> Callable[[Progress], None]:
     def listen(event: Progress) -> None:
+        limit.check(event.polygons, event.corners)
         phases.announce(ProgressEvent("traverse", event.nodes, event.polygons))
 
     return listen
@@ -130,10 +131,10 @@ def _traversal_listener(phases: _Phases) -> Callable[[Progress], None] | None:
 
 def findings(
     model: Model,
+    found: Extraction,
     invariants: Invariants,
     parity: Parity | None,
     residuals: Residuals | None,
-    statistics: TraversalStatistics,
 ) -> tuple[list[str], list[str]]:
     """What failed, and what is legal but worth knowing, a sentence each."""
     problems, notes = invariants.problems(), invariants.notes()
@@ -144,26 +145,20 @@ def findings(
         )
     if parity is not None and parity.note:
         notes.append(f"{parity.note}; compared with {parity.runtime} instead")
-    if statistics.constant_cells:
+    if found.flat_regions:
         notes.append(
-            f"f is at the level throughout {statistics.constant_cells} cells: the level set has solid parts there, "
-            "of which the mesh shows the boundary at most"
+            f"f is at the level throughout parts of the box (about {found.flat_regions.share:.2g} of it): "
+            "of the level set there, the mesh shows the border with f < level only"
+        )
+    if found.degeneracy.perturbation is not None:
+        notes.append(
+            f"degenerate network ({'; '.join(found.degeneracy.found)}): the mesh is the limit of that of a network "
+            f"perturbed by {found.degeneracy.perturbation:g}; its vertices were taken back by up to "
+            f"{found.degeneracy.displacement:.2g}"
         )
     if not invariants.polygons:
         notes.append(empty_level_set(model))
     return problems, notes
-
-
-def empty_soup(dimension: int) -> PolygonSoup:
-    """What a traversal gives that finds nothing."""
-    return PolygonSoup(
-        offsets=np.zeros(1, np.int64),
-        positions=np.empty((0, dimension)),
-        keys=np.empty((0, 2), np.uint64),
-        box_faces=np.empty(0, np.int8),
-        gradients=np.empty((0, dimension)),
-        errors=np.empty(0),
-    )
 
 
 def empty_level_set(model: Model) -> str:
@@ -175,7 +170,7 @@ def empty_level_set(model: Model) -> str:
     values = model.evaluate(_grid(model))
     nearest = values[np.abs(values - model.level).argmin()]
     return (
-        f"the level set is empty: {reason}; of the output's values on a grid, {nearest:.6g} is the nearest to the level "
+        f"the level set is empty: {reason}; of the output's values on a grid, {nearest:.6g} is nearest to the level "
         f"{model.level:g}; try another level or larger bounds"
     )
 

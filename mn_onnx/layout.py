@@ -85,9 +85,11 @@ class Layout:
             if isinstance(entry, BoundInput):
                 feeds[entry.name] = entry.array(n)
                 continue
-            columns = np.tile(entry.values, (n, 1))
-            moving = [k for k, coordinate in enumerate(entry.columns) if coordinate >= 0]
-            columns[:, moving] = points[:, [entry.columns[k] for k in moving]]
+            columns = points
+            if entry.columns != tuple(range(self.dim)):
+                columns = np.tile(entry.values, (n, 1))
+                moving = [k for k, coordinate in enumerate(entry.columns) if coordinate >= 0]
+                columns[:, moving] = points[:, [entry.columns[k] for k in moving]]
             feeds[entry.name] = np.array(entry.arrange(columns), entry.dtype, order="C")
         return feeds
 

@@ -2,16 +2,17 @@
 
 Its keys:
 
-- ``model``, ``model_sha256``, ``output``, ``level``, ``bounds``, ``threads``, ``versions``: what was extracted, with what;
+- ``model``, ``model_sha256``, ``output``, ``level``, ``bounds``, ``threads``, ``versions``: what was extracted by what;
 - ``exact``, and ``surrogate_eps``: a proved bound on |f_true - f| in the box, zero for exact networks;
 - ``output_range``: the certified range of the piecewise-linear f, which is zero on the level set, in the box;
 - ``polygons``, ``vertices``, ``edges``, ``euler``, ``components``, ``closed`` (every edge inside the box joins two
   polygons), ``boundary_edges`` (on the box), ``unmatched_edges``, and the other values of `Invariants`;
-- ``max_abs_f``, ``mean_abs_f``, ``ort_mean_abs_f`` and the other values of `Residuals`, null where there was no check or
-  nothing to measure;
+- ``max_abs_f``, ``mean_abs_f``, ``ort_mean_abs_f`` and the other values of `Residuals`, null where there was no check
+  or nothing to measure;
 - ``parity_max_abs_err``, ``parity_allowed_err``, ``parity_points``, ``parity_runtime``, ``parity_note``: the comparison
   of the imported network with onnxruntime, null without checks;
-- ``nodes`` and the other counts of `mn_onnx.extract.schedule.TraversalStatistics`, under ``traversal`` as well;
+- ``nodes``; and the counts of `mn_onnx.extract.schedule.TraversalStatistics` under ``traversal``, with the ``profile``
+  that `mn_onnx.profile` describes;
 - ``seconds``: import, lower, compile (loading or compiling the kernels), traverse, weld, check, write;
 - ``problems``: what failed, ``notes``: what is legal but worth knowing.
 """
@@ -24,13 +25,12 @@ from dataclasses import asdict
 from importlib.metadata import version
 from typing import Any
 
-import numpy as np
-
 from mn_onnx import __version__
 from mn_onnx.extract.invariants import Invariants
 from mn_onnx.extract.schedule import TraversalStatistics
 from mn_onnx.model import Model
 from mn_onnx.parity import Parity
+from mn_onnx.profile import profile_entries
 from mn_onnx.residual import Residuals
 
 
@@ -82,10 +82,7 @@ def build_report(
         **check_entries(parity, residuals),
         "nodes": statistics.nodes,
         "threads": statistics.threads,
-        "traversal": {
-            name: value.tolist() if isinstance(value, np.ndarray) else value
-            for name, value in asdict(statistics).items()
-        },
+        "traversal": {**asdict(statistics), "profile": profile_entries(statistics.profile)},
         "seconds": dict(seconds),
         "problems": list(problems),
         "notes": list(notes),

@@ -39,10 +39,11 @@ _ORT_REFUSALS = (
 class Runtime:
     """Evaluates the model as it was stored, at points. ``name`` says by which program; ``note`` why not onnxruntime.
 
-    ``most_points``: how many it evaluates in reasonable time. Raises `CheckFailed` where no program can load the model.
+    ``threads``: for onnxruntime, its own choice by default. ``most_points``: how many it evaluates in reasonable time.
+    Raises `CheckFailed` where no program can load the model.
     """
 
-    def __init__(self, read: ReadModel, layout: Layout) -> None:
+    def __init__(self, read: ReadModel, layout: Layout, *, threads: int | None = None) -> None:
         if layout.batch is not None and layout.batch > CHUNK:
             raise CheckFailed(
                 [f"the model takes {layout.batch:,} points at once, too many to run it for comparison; {_REMEDY}"]
@@ -51,7 +52,7 @@ class Runtime:
         self.most_points = CALLS * (layout.batch or CHUNK)
         self.note = ""
         try:
-            self._run = _onnxruntime(read.original, layout.output.name)
+            self._run = _onnxruntime(read.original, layout.output.name, threads)
             self.name = f"onnxruntime {onnxruntime.__version__}"
         except _ORT_REFUSALS as error:
             self.note = f"onnxruntime cannot run this model ({str(error).splitlines()[0]})"
@@ -70,8 +71,9 @@ class Runtime:
         return values
 
 
-def _onnxruntime(model: onnx.ModelProto, output: str) -> Run:
+def _onnxruntime(model: onnx.ModelProto, output: str, threads: int | None) -> Run:
     options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = threads or 0  # 0: as onnxruntime sees fit
     options.log_severity_level = 4  # what goes wrong arrives as an exception
     try:
         session = onnxruntime.InferenceSession(model.SerializeToString(), options, ["CPUExecutionProvider"])

@@ -7,12 +7,13 @@ import numpy as np
 from mn_onnx.extract.invariants import check_invariants
 from mn_onnx.extract.sampling import sample_surface
 from mn_onnx.extract.schedule import traverse
+from mn_onnx.extract.surface import Surface
 from mn_onnx.extract.weld import weld
 from mn_onnx.ir.network import AffineRow, KnotTable, Network, Unit
 
 
-def warm_up(dimension: int) -> None:
-    """Extract |x_0| + ... = 1 / 2, which goes once through every kernel."""
+def warm_up(dimension: int) -> Surface:
+    """The surface |x_0| + ... = 1 / 2; making it goes once through every kernel that extraction and checks need."""
     one = np.ones(1)
     table = KnotTable.exact([0.0], [[-1.0, 1.0]], [[0.0, 0.0]])
     units = tuple(
@@ -24,3 +25,4 @@ def warm_up(dimension: int) -> None:
     surface = weld(soup, threads=1)
     check_invariants(surface)
     sample_surface(surface, 1)
+    return surface

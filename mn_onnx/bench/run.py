@@ -1,0 +1,143 @@
+"""A benchmark from start to end: models by methods, one fresh process for each."""
+
+from __future__ import annotations
+
+import os
+import platform
+from collections.abc import Callable, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from dataclasses import dataclass, field
+from importlib.metadata import version
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+import psutil
+
+from mn_onnx.bench.extras import RECALL, SAMPLING, require
+from mn_onnx.bench.quality import reference_points
+from mn_onnx.bench.result import BenchResult, Measurement, ModelResult
+from mn_onnx.bench.worker import Failure, Job, measure
+from mn_onnx.errors import MnOnnxError, UsageError
+from mn_onnx.extract.blocks import resolve_threads
+from mn_onnx.extract.files import MeshFileError
+from mn_onnx.model import LoadOptions, load
+from mn_onnx.report import versions
+
+GRIDS = (64, 128, 256)
+SAMPLES = 1 << 20
+REPEAT = 3
+
+
+@dataclass(frozen=True)
+class BenchOptions:
+    """How to measure.
+
+    ``grids``: points per axis of marching cubes. ``threads``: for both methods, all cores by default. ``repeat``: runs
+    of which the median counts. ``samples``: points of a mesh at which soft precision is measured. ``reference``: mesh
+    file of the true shape, for soft recall. ``max_memory``: bytes that exact extraction may take, by default most of
+    what is available. ``load``: options of `mn_onnx.load` for all models.
+    """
+
+    grids: Sequence[int] = GRIDS
+    threads: int | None = None
+    repeat: int = REPEAT
+    samples: int = SAMPLES
+    reference: str | None = None
+    max_memory: int | None = None
+    load: LoadOptions = field(default_factory=LoadOptions)
+
+
+def run_bench(
+    models: Sequence[str | os.PathLike[str]],
+    options: BenchOptions | None = None,
+    *,
+    on_start: Callable[[str], None] | None = None,
+) -> BenchResult:
+    """Measure exact extraction and marching cubes on each of ``models`` (paths).
+
+    ``on_start`` is called with a line before each measurement. What fails for one method is told in the ``failures`` of
+    its model. Raises `UsageError` before anything is measured if an option, a model or the reference is
+    unusable, or if packages of the extra ``bench`` are missing.
+    """
+    options = options or BenchOptions()
+    _validate(options)
+    machine = _machine()
+    paths = [Path(model) for model in models]
+    hashes = _check_models(paths, options.load)
+    threads = resolve_threads(options.threads)
+    results = []
+    for path, sha256 in zip(paths, hashes, strict=True):
+        outcomes = []
+        for resolution in (None, *sorted(set(options.grids))):
+            job = Job(
+                path=str(path),
+                load=options.load,
+                resolution=resolution,
+                threads=threads,
+                repeat=options.repeat,
+                samples=options.samples,
+                reference=options.reference,
+                max_memory=options.max_memory,
+            )
+            if on_start is not None:
+                on_start(f"{path.name}: {job.title}")
+            outcomes.append(_in_fresh_process(job))
+        measurements = [outcome for outcome in outcomes if isinstance(outcome, Measurement)]
+        failures = [outcome.reason for outcome in outcomes if isinstance(outcome, Failure)]
+        results.append(ModelResult(path.name, sha256, measurements, failures))
+    return BenchResult(machine, threads, options.repeat, options.samples, options.reference, results)
+
+
+def _validate(options: BenchOptions) -> None:
+    counts = [("repeat", options.repeat, 1), ("samples", options.samples, 1)]
+    counts += [("a grid", grid, 2) for grid in options.grids]
+    if options.threads is not None:
+        counts.append(("threads", options.threads, 1))
+    problems = [f"{name} must be at least {least}, not {value}" for name, value, least in counts if value < least]
+    if problems:
+        raise UsageError("; ".join(problems))
+    require(SAMPLING | RECALL if options.reference else SAMPLING)
+    if options.reference:
+        try:
+            reference_points(options.reference)
+        except (MeshFileError, OSError, ValueError) as error:
+            raise UsageError(f"--reference {options.reference}: {error}") from error
+
+
+def _check_models(paths: Sequence[Path], options: LoadOptions) -> list[str]:
+    """The hashes of models that can be measured; raises `UsageError` with the reasons of all that cannot."""
+    hashes, problems = [], []
+    for path in paths:
+        try:
+            model = load(path, **options)
+        except MnOnnxError as error:
+            problems.append(f"{path}: {error}")
+            continue
+        if model.dimension != 3:
+            problems.append(
+                f"{path}: marching cubes needs a field over 3 coordinates, this one is over {model.dimension}"
+            )
+        hashes.append(model.read.sha256)
+    if problems:
+        raise UsageError("\n".join(problems))
+    return hashes
+
+
+def _in_fresh_process(job: Job) -> Measurement | Failure:
+    with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
+        try:
+            return pool.submit(measure, job).result()
+        except BrokenProcessPool:
+            return Failure(f"{job.title}: the process was ended from outside, probably for lack of memory")
+
+
+def _machine() -> dict[str, Any]:
+    return {
+        "cores": os.cpu_count(),
+        "architecture": platform.machine(),
+        "memory_bytes": int(psutil.virtual_memory().total),
+        "load_before": os.getloadavg()[0] if hasattr(os, "getloadavg") else None,
+        "versions": {**versions(), "scikit-image": version("scikit-image")},
+    }

@@ -1,0 +1,64 @@
+"""Where the time of an extraction went, as text (``--profile``) and as entries of the report.
+
+The table of phases has the seconds of each. The table of cells says at which size of network the traversal spends its
+time. A cell's *system* is the network restricted to it, or to an ancestor since which nothing was folded away; cells
+are grouped by the number of units of that system, in powers of two. Per group: *cells* visited, *share* of all
+processor cycles spent on visits, and *cycles* per cell, as the processor's time-stamp counter tells them. Many cells in
+the upper groups: the bounds prune too little, or folding comes too late. Most of the time in the lowest groups: cutting
+polytopes and emitting polygons is what counts.
+
+The counts: *pruned* cells that the bound of the output excludes when visited, *halves pruned* before they became cells,
+*folds* of systems, *leaves* whose polygons were emitted, *deepest* level of the tree, *subtrees* given to threads.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+def profile_entries(profile: NDArray[np.int64] | None) -> list[dict[str, Any]]:
+    """The groups that have cells, ready for JSON: ``units`` [least, most], ``cells``, ``share``, ``cycles_per_cell``.
+
+    ``profile``: int64 [2, n], cells and cycles by the bit length of the number of units; None gives an empty list.
+    """
+    if profile is None:
+        return []
+    total = max(int(profile[1].sum()), 1)
+    return [
+        {
+            "units": [1 << (length - 1), (1 << length) - 1] if length else [0, 0],
+            "cells": int(cells),
+            "share": int(cycles) / total,
+            "cycles_per_cell": int(cycles) / int(cells),
+        }
+        for length, (cells, cycles) in enumerate(profile.T)
+        if cells
+    ]
+
+
+def profile_text(report: Mapping[str, Any]) -> str:
+    """The profile in a report, as tables of plain text."""
+    seconds, traversal = report["seconds"], report["traversal"]
+    total = sum(seconds.values()) or 1.0
+    lines = ["phase          seconds   share"]
+    lines += [f"{name:<12} {spent:>9.3f} {spent / total:>7.1%}" for name, spent in seconds.items()]
+    lines += ["", "units of system        cells   share   cycles per cell"]
+    for group in traversal["profile"]:
+        low, high = group["units"]
+        units = f"{low}" if low == high else f"{low} to {high}"
+        lines.append(f"{units:<15} {group['cells']:>12,} {group['share']:>7.1%} {group['cycles_per_cell']:>17,.0f}")
+    nodes = max(traversal["nodes"], 1)
+    polygons = report["polygons"]
+    lines += [
+        "",
+        f"cells {traversal['nodes']:,}: pruned {traversal['pruned'] / nodes:.1%}, "
+        f"leaves {traversal['leaves'] / nodes:.1%}, halves pruned {traversal['children_pruned']:,}, "
+        f"folds {traversal['folds']:,}",
+        f"polygons {polygons:,}, cells per polygon {traversal['nodes'] / max(polygons, 1):.2f}, "
+        f"deepest {traversal['deepest']}, subtrees {traversal['subtrees']}, threads {traversal['threads']}",
+    ]
+    return "\n".join(lines)
