@@ -245,7 +245,8 @@ def traverse(
     """Find every polygon of the level set f = 0 of a canonical network in a box.
 
     ``lower``, ``upper``: float64 [3]. ``threads``: number of worker threads, all cores by default; the result does not
-    depend on it. ``progress`` is called from the calling thread a few times a second.
+    depend on it. ``progress`` is called from the calling thread a few times a second, and once at the end; what it
+    raises stops the workers and is passed on.
 
     Raises ``ValueError`` for a network that is not canonical or an empty box. An interrupt (KeyboardInterrupt) stops
     all workers and is passed on.
@@ -268,17 +269,20 @@ def traverse(
         except BaseException as error:  # noqa: BLE001 - whatever it is, the caller gets it
             pool.fail(error)
 
+    def report() -> None:
+        if progress is not None:
+            nodes = sum(int(worker.control[kernel.NODES]) for worker in workers)
+            polygons = sum(worker.polygons + int(worker.output.counts[0]) for worker in workers)
+            corners = sum(worker.corners + int(worker.output.counts[1]) for worker in workers)
+            progress(Progress(nodes, polygons, corners))
+
     crew = [threading.Thread(target=work, args=(worker,), daemon=True) for worker in workers]
     for thread in crew:
         thread.start()
     try:
         while any(thread.is_alive() for thread in crew):
             next(thread for thread in crew if thread.is_alive()).join(0.2)
-            if progress is not None:
-                nodes = sum(int(worker.control[kernel.NODES]) for worker in workers)
-                polygons = sum(worker.polygons + int(worker.output.counts[0]) for worker in workers)
-                corners = sum(worker.corners + int(worker.output.counts[1]) for worker in workers)
-                progress(Progress(nodes, polygons, corners))
+            report()
     finally:
         for worker in workers:
             worker.control[kernel.STOP] = 1
@@ -286,6 +290,7 @@ def traverse(
             thread.join()
     if pool.error is not None:
         raise pool.error
+    report()
     return _collect(first), _statistics(workers, pool)
 
 

@@ -16,7 +16,7 @@ def print_result(result: BenchResult, console: Console) -> None:
         lines = [_phases(entry) for entry in model.measurements]
         lines += [f"{entry.title}: {entry.note}" for entry in model.measurements if entry.note]
         for line in (*lines, *model.failures):
-            console.print(f"  {line}", markup=False, highlight=False)
+            console.print(f"  {line}", markup=False, highlight=False, soft_wrap=True)
 
 
 def _table(result: BenchResult, model: ModelResult) -> Table:
