@@ -26,9 +26,12 @@ from mn_onnx.residual import Residuals, measure_residuals
 from mn_onnx.runtime import Runtime
 from mn_onnx.warmup import warm_up
 
+DIMENSION = 3
+"""Coordinates of a point on a mesh."""
+
 
 @dataclass
-class _Phases:
+class Phases:
     """Tells the listener which phase begins, and keeps the time of each."""
 
     listener: ProgressCallback | None
@@ -68,7 +71,7 @@ def extract(
     Raises `UsageError` and `ModelRefused` as `load`; `CheckFailed` with every failed check (``error.surface`` is the
     mesh, if there is one already); `MemoryLimitReached` if the mesh would not fit in ``max_memory``.
     """
-    phases = _Phases(progress)
+    phases = Phases(progress)
     if isinstance(source, Model):
         if options:
             raise UsageError(f"the model is loaded already: give {', '.join(options)} to load")
@@ -76,6 +79,13 @@ def extract(
     else:
         phases.announce(ProgressEvent("import"))
         model = load(source, **options)
+    if model.dimension != DIMENSION:
+        raise UsageError(
+            f"the field has {model.dimension} coordinates, but a mesh needs {DIMENSION}; curves and roots are extracted by "
+            "mn_onnx.extract.planar"
+        )
+    if model.dimension != 3:
+        raise UsageError(f"the field is over {model.dimension} coordinates: use extract_planar, or write .svg or .json")
     if threads is not None and threads < 1:
         raise UsageError(f"threads must be at least 1, not {threads}")
     limit = MemoryLimit.of(max_memory)
@@ -89,13 +99,13 @@ def extract(
             if parity.problems():
                 raise CheckFailed(parity.problems())
     with phases.phase("compile"):
-        warm_up(model.dimension)
+        warm_up(DIMENSION)
     found = extract_surface(
         model.network,
         model.lower,
         model.upper,
         threads=threads,
-        progress=_traversal_listener(phases, limit),
+        progress=traversal_listener(phases, limit),
         on_phase=lambda name: phases.announce(ProgressEvent(name)),
     )
     phases.seconds.update(found.seconds)
@@ -121,7 +131,9 @@ def extract(
     return surface
 
 
-def _traversal_listener(phases: _Phases, limit: MemoryLimit) -> Callable[[Progress], None]:
+def traversal_listener(phases: Phases, limit: MemoryLimit) -> Callable[[Progress], None]:
+    """What to give a traversal as its listener: watches the memory and passes the progress on."""
+
     def listen(event: Progress) -> None:
         limit.check(event.polygons, event.corners)
         phases.announce(ProgressEvent("traverse", event.nodes, event.polygons))

@@ -13,7 +13,9 @@ Its keys:
   of the imported network with onnxruntime, null without checks;
 - ``nodes``; and the counts of `mn_onnx.extract.schedule.TraversalStatistics` under ``traversal``, with the ``profile``
   that `mn_onnx.profile` describes;
-- ``seconds``: import, lower, compile (loading or compiling the kernels), traverse, weld, check, write;
+- ``degeneracy``, ``flat_regions``: `Degeneracy` and `FlatRegions`, what was not in general position and what was done;
+- ``seconds``: import, lower, compile (loading or compiling the kernels), traverse, weld, check, write; flat (looking
+  for regions of zeros), and perturb where planes coincide;
 - ``problems``: what failed, ``notes``: what is legal but worth knowing.
 """
 
@@ -27,7 +29,7 @@ from typing import Any
 
 from mn_onnx import __version__
 from mn_onnx.extract.invariants import Invariants
-from mn_onnx.extract.schedule import TraversalStatistics
+from mn_onnx.extract.pipeline import Extraction
 from mn_onnx.model import Model
 from mn_onnx.parity import Parity
 from mn_onnx.profile import profile_entries
@@ -51,24 +53,28 @@ def model_entries(model: Model) -> dict[str, Any]:
 
 def check_entries(parity: Parity | None, residuals: Residuals | None) -> dict[str, Any]:
     """The part of a report that tells of comparisons; null where there were none."""
-    entries: dict[str, Any] = {
+    measured = asdict(residuals) if residuals else dict.fromkeys(Residuals.__dataclass_fields__)
+    measured["residual_points"] = measured.pop("points")
+    measured["residual_ratio"] = measured.pop("worst_ratio")
+    return parity_entries(parity) | measured
+
+
+def parity_entries(parity: Parity | None) -> dict[str, Any]:
+    """The part of a report that tells of the comparison with onnxruntime; null where there was none."""
+    return {
         "parity_runtime": parity.runtime if parity else None,
         "parity_note": parity.note if parity else None,
         "parity_points": parity.points if parity else None,
         "parity_max_abs_err": parity.max_abs_err if parity else None,
         "parity_allowed_err": parity.allowed_err if parity else None,
     }
-    measured = asdict(residuals) if residuals else dict.fromkeys(Residuals.__dataclass_fields__)
-    measured["residual_points"] = measured.pop("points")
-    measured["residual_ratio"] = measured.pop("worst_ratio")
-    return entries | measured
 
 
 def build_report(
     model: Model,
+    found: Extraction,
     *,
     invariants: Invariants,
-    statistics: TraversalStatistics,
     parity: Parity | None,
     residuals: Residuals | None,
     seconds: Mapping[str, float],
@@ -76,6 +82,7 @@ def build_report(
     notes: Sequence[str],
 ) -> dict[str, Any]:
     """All entries; see the description of this module."""
+    statistics = found.statistics
     return {
         **model_entries(model),
         **invariants.as_dict(),
@@ -83,6 +90,8 @@ def build_report(
         "nodes": statistics.nodes,
         "threads": statistics.threads,
         "traversal": {**asdict(statistics), "profile": profile_entries(statistics.profile)},
+        "degeneracy": asdict(found.degeneracy),
+        "flat_regions": asdict(found.flat_regions),
         "seconds": dict(seconds),
         "problems": list(problems),
         "notes": list(notes),

@@ -59,7 +59,7 @@ def test_extract_writes_mesh_and_report(model: Path, tmp_path: Path) -> None:
         "model_sha256", "versions",
     }  # fmt: skip
     assert asked_for <= report.keys()
-    assert set(report["seconds"]) == {"import", "lower", "compile", "traverse", "weld", "check", "write"}
+    assert {"import", "lower", "compile", "traverse", "weld", "check", "write"} <= report["seconds"].keys()
     assert report["polygons"] == 8
     assert leftovers(tmp_path) == ["mesh.ply", "report.json"]
 

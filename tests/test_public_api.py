@@ -62,11 +62,11 @@ def test_extracts_an_octahedron_with_a_full_report() -> None:
     assert report["parity_max_abs_err"] <= report["parity_allowed_err"] < 1e-5
     assert report["nodes"] > 0
     assert len(report["model_sha256"]) == 64
-    assert set(report["seconds"]) == {"import", "lower", "compile", "traverse", "weld", "check"}
+    assert {"import", "lower", "compile", "traverse", "weld", "check"} <= report["seconds"].keys()
     assert "numba" in report["versions"]
     assert report["problems"] == []
     order = list(dict.fromkeys(phases))
-    assert order == ["import", "check", "compile", "traverse", "weld"]
+    assert order == ["import", "check", "compile", "traverse", "weld", "flat"]
 
 
 def test_loading_apart_from_extracting() -> None:
