@@ -1,4 +1,4 @@
-"""Files of polylines: the format follows the file's extension."""
+"""Files of polylines and of roots: the format follows the file's extension."""
 
 from __future__ import annotations
 
@@ -11,41 +11,49 @@ from typing import BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from mn_onnx.extract.curve import Curve
+from mn_onnx.extract.curve import Curve, Roots
 from mn_onnx.extract.files.polygon_mesh import MeshFileError
 
 STROKE = 1 / 400
 """Width of the lines in a drawing, relative to the longer side of the box."""
 
 
-def write_curve(curve: Curve, path: str | os.PathLike[str]) -> None:
+def write_curve(curve: Curve | Roots, path: str | os.PathLike[str]) -> None:
     """Write ``curve`` in the format of the extension of ``path``. The file appears whole or not at all.
 
     .svg: a drawing of the box, y upwards, {f < 0} shaded where all polylines are closed; coordinates have 9 digits.
     .json: ``lower`` and ``upper`` of the box and a list ``polylines``, each with ``closed`` and ``points``.
-    .npz: the arrays of `Curve` by name. Both hold float64 exactly.
+    .npz: the arrays of `Curve` by name. Both hold float64 exactly. Roots go to .json and .npz, by the names in `Roots`.
 
     Raises MeshFileError for an unknown extension or a folder that does not exist; OSError if writing fails.
     """
     target = Path(path)
-    check_curve_path(target)
+    dimension = 1 if isinstance(curve, Roots) else 2
+    check_curve_path(target, dimension)
     partial = target.with_name(f".{target.name}.{os.getpid()}.partial")
     try:
         with partial.open("wb") as stream:
-            _WRITERS[target.suffix.lower()](stream, curve)
+            if isinstance(curve, Roots):
+                _ROOT_WRITERS[target.suffix.lower()](stream, curve)
+            else:
+                _WRITERS[target.suffix.lower()](stream, curve)
         partial.replace(target)
     except BaseException:
         partial.unlink(missing_ok=True)
         raise
 
 
-def check_curve_path(path: str | os.PathLike[str]) -> None:
-    """Raise MeshFileError, with all reasons, if `write_curve` could not write to ``path``."""
+def check_curve_path(path: str | os.PathLike[str], dimension: int = 2) -> None:
+    """Raise MeshFileError, with all reasons, if `write_curve` could not write to ``path``.
+
+    ``dimension``: 2 for a `Curve`, 1 for `Roots`.
+    """
     target = Path(path)
     problems = []
-    if target.suffix.lower() not in _WRITERS:
+    kind, writers = ("a curve", list(_WRITERS)) if dimension == 2 else ("roots", list(_ROOT_WRITERS))
+    if target.suffix.lower() not in writers:
         found = f"ends in {target.suffix}" if target.suffix else "has no extension"
-        problems.append(f"{target} {found}; a curve is written to {', '.join(_WRITERS)}")
+        problems.append(f"{target} {found}; the level set of this model is {kind}, written to {', '.join(writers)}")
     if not target.parent.is_dir():
         problems.append(f"the folder {target.parent} does not exist")
     elif target.is_dir():
@@ -95,8 +103,35 @@ def _write_npz(stream: BinaryIO, curve: Curve) -> None:
     )
 
 
+def _write_roots_json(stream: BinaryIO, roots: Roots) -> None:
+    entries = {
+        "lower": roots.lower,
+        "upper": roots.upper,
+        "positions": roots.positions.tolist(),
+        "slopes": roots.slopes.tolist(),
+        "errors": roots.errors.tolist(),
+    }
+    stream.write(json.dumps(entries).encode())
+
+
+def _write_roots_npz(stream: BinaryIO, roots: Roots) -> None:
+    np.savez_compressed(
+        stream,
+        positions=roots.positions,
+        slopes=roots.slopes,
+        errors=roots.errors,
+        lower=np.array(roots.lower),
+        upper=np.array(roots.upper),
+    )
+
+
 _WRITERS: Mapping[str, Callable[[BinaryIO, Curve], None]] = {
     ".svg": _write_svg,
     ".json": _write_json,
     ".npz": _write_npz,
+}
+
+_ROOT_WRITERS: Mapping[str, Callable[[BinaryIO, Roots], None]] = {
+    ".json": _write_roots_json,
+    ".npz": _write_roots_npz,
 }

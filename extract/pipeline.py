@@ -119,7 +119,7 @@ def extract_surface(
     with run.phase("traverse"):
         soup, statistics = traverse(network, run.lower, run.upper, threads=threads, progress=progress)
     with run.phase("weld"):
-        surface, degeneracy = _as_it_is(soup, run)
+        surface, degeneracy = _as_it_is(soup, statistics.broken_cuts, run)
         del soup
     flat_regions = FlatRegions()
     if not degeneracy.found:
@@ -136,13 +136,14 @@ def extract_surface(
     return Extraction(surface, statistics, degeneracy, flat_regions, run.seconds)
 
 
-def _as_it_is(soup: PolygonSoup, run: _Run) -> tuple[Surface, Degeneracy]:
+def _as_it_is(soup: PolygonSoup, broken_cuts: int, run: _Run) -> tuple[Surface, Degeneracy]:
     """The surface of an unperturbed ``soup``; ``found`` tells what in it only rounding can have caused."""
     soup, n_dropped = _whole_polygons(soup)
     surface = weld(soup, threads=run.threads)
-    if n_dropped or _torn(surface):
-        dropped = (f"{n_dropped} polygons with fewer than 3 corners",) if n_dropped else ()
-        return surface, Degeneracy((*dropped, *_torn(surface)))
+    counts = ((broken_cuts, "cells too degenerate to be cut"), (n_dropped, "polygons with fewer than 3 corners"))
+    found = (*(f"{count} {what}" for count, what in counts if count), *_torn(surface))
+    if found:
+        return surface, Degeneracy(found)
     surface, degeneracy = _cleaned(surface, run, 0.0, Degeneracy())
     return surface, replace(degeneracy, found=(*_torn(surface), *_doubtful(surface, run.coincidence)))
 

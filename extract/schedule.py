@@ -49,7 +49,7 @@ class TraversalStatistics:
     children_pruned: int = 0
     leaves: int = 0
     folds: int = 0
-    constant_cells: int = 0
+    broken_cuts: int = 0
     deepest: int = 0
     subtrees: int = 0
     threads: int = 1
@@ -304,7 +304,7 @@ def _statistics(workers: list[_Worker], pool: _Pool) -> TraversalStatistics:
         children_pruned=total(kernel.CHILDREN_PRUNED),
         leaves=total(kernel.LEAVES),
         folds=total(kernel.FOLDS),
-        constant_cells=total(kernel.CONSTANT_CELLS),
+        broken_cuts=total(kernel.BROKEN_CUTS),
         deepest=max(int(worker.control[kernel.DEEPEST]) for worker in workers),
         subtrees=pool.subtrees,
         threads=len(workers),

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from mn_onnx.extract.surface import Surface
     from mn_onnx.extraction import extract
     from mn_onnx.model import Model, load
+    from mn_onnx.planar import PlanarLevelSet, extract_planar
 
 __version__ = "0.1.0"
 
@@ -26,9 +27,11 @@ _HOMES = {
     "MnOnnxError": "mn_onnx.errors",
     "Model": "mn_onnx.model",
     "ModelRefused": "mn_onnx.errors",
+    "PlanarLevelSet": "mn_onnx.planar",
     "Problem": "mn_onnx.errors",
     "Surface": "mn_onnx.extract.surface",
     "UsageError": "mn_onnx.errors",
+    "extract_planar": "mn_onnx.planar",
     "load": "mn_onnx.model",
     "read_mesh": "mn_onnx.extract.files",
     "write_mesh": "mn_onnx.extract.files",
@@ -39,10 +42,12 @@ __all__ = [
     "MnOnnxError",
     "Model",
     "ModelRefused",
+    "PlanarLevelSet",
     "Problem",
     "Surface",
     "UsageError",
     "extract",
+    "extract_planar",
     "load",
     "read_mesh",
     "write_mesh",

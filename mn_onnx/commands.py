@@ -13,7 +13,8 @@ from typing import Any
 from mn_onnx import options as parse
 from mn_onnx.errors import CheckFailed, ModelRefused, UsageError
 from mn_onnx.memory import parse_size
-from mn_onnx.model import LoadOptions, load
+from mn_onnx.model import LoadOptions, Model, load
+from mn_onnx.progress import ProgressCallback
 
 
 def run_extract(options: argparse.Namespace) -> int:
@@ -26,15 +27,17 @@ def run_extract(options: argparse.Namespace) -> int:
     from mn_onnx.profile import profile_text
     from mn_onnx.progress import ProgressEvent, TerminalProgress
 
-    try:
-        check_mesh_options(options.mesh, float64=options.float64)
-    except MeshFileError as error:
-        raise UsageError(str(error)) from error
     if options.report is not None:
         _check_parent("--report", Path(options.report))
     with TerminalProgress(enabled=not options.quiet) as progress:
         progress(ProgressEvent("import"))
         model = load(options.model, **_load_options(options))
+        if model.dimension < 3:
+            return _extract_planar(options, model, progress)
+        try:
+            check_mesh_options(options.mesh, float64=options.float64)
+        except MeshFileError as error:
+            raise UsageError(str(error)) from error
         try:
             surface = extract(
                 model,
@@ -66,6 +69,53 @@ def run_extract(options: argparse.Namespace) -> int:
     if not options.quiet:
         print(_summary(options.mesh, report))
     return 0
+
+
+def _extract_planar(options: argparse.Namespace, model: Model, progress: ProgressCallback) -> int:
+    """`run_extract` for a network over one or two coordinates."""
+    from mn_onnx.extract.curve_files import check_curve_path, write_curve
+    from mn_onnx.extract.files import MeshFileError
+    from mn_onnx.planar import extract_planar
+    from mn_onnx.progress import ProgressEvent
+
+    try:
+        check_curve_path(options.mesh, model.dimension)
+    except MeshFileError as error:
+        raise UsageError(str(error)) from error
+    found = extract_planar(
+        model,
+        threads=options.threads,
+        check=not options.no_check,
+        max_memory=_max_memory(options),
+        progress=progress,
+    )
+    _write_report(options.report, found.report)
+    if not len(found.points):
+        raise CheckFailed(found.report["notes"])
+    progress(ProgressEvent("write"))
+    try:
+        write_curve(found.level_set, options.mesh)
+    except OSError as error:
+        raise UsageError(f"cannot write {options.mesh}: {error.strerror or error}") from error
+    if not options.quiet:
+        print(_planar_summary(options.mesh, found.report))
+    return 0
+
+
+def _planar_summary(path: str, report: dict[str, Any]) -> str:
+    """A few lines about a curve or roots."""
+    if "roots" in report:
+        what = f"{report['roots']:,} roots"
+    else:
+        closure = "closed" if report["closed"] else "open where it leaves the box"
+        what = (
+            f"{report['polylines']:,} polylines of {report['segments']:,} segments, length {report['length']:.6g}, "
+            f"{closure}"
+        )
+    lines = [f"{path}: {what}; max |f| {report['max_abs_f']:.2g}"]
+    if not report["exact"]:
+        lines.append(f"  surrogates within {report['surrogate_eps']:.2g} of the true network")
+    return "\n".join(lines)
 
 
 def run_inspect(options: argparse.Namespace) -> int:

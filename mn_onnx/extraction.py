@@ -81,11 +81,9 @@ def extract(
         model = load(source, **options)
     if model.dimension != DIMENSION:
         raise UsageError(
-            f"the field has {model.dimension} coordinates, but a mesh needs {DIMENSION}; curves and roots are extracted by "
-            "mn_onnx.extract.planar"
+            f"the field has {model.dimension} coordinates, but a mesh needs {DIMENSION}; "
+            "curves and roots are extracted by mn_onnx.extract_planar"
         )
-    if model.dimension != 3:
-        raise UsageError(f"the field is over {model.dimension} coordinates: use extract_planar, or write .svg or .json")
     if threads is not None and threads < 1:
         raise UsageError(f"threads must be at least 1, not {threads}")
     limit = MemoryLimit.of(max_memory)

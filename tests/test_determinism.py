@@ -53,9 +53,10 @@ def _assert_same_polygons(first: PolygonSoup, second: PolygonSoup) -> None:
 
 @pytest.mark.parametrize("name", NETWORKS)
 def test_soup_does_not_depend_on_threads(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Workers look after every few cells whether another one is idle, so that many subtrees change hands."""
+    """Workers give subtrees away after every few cells, whether another one is idle or not."""
     one = _soup(NETWORKS[name], 1)
     monkeypatch.setattr(schedule, "BUDGET", 5000)
+    monkeypatch.setattr(schedule._Pool, "wants_more", lambda pool: True)
     for threads in (2, 4):
         other, statistics = traverse(NETWORKS[name], LOWER, UPPER, threads=threads)
         assert statistics.subtrees > 1

@@ -172,7 +172,7 @@ def test_svg_is_a_drawing_of_the_box(curve: Curve, tmp_path: Path) -> None:
 
 def test_refused_paths_leave_nothing(curve: Curve, tmp_path: Path) -> None:
     with pytest.raises(
-        MeshFileError, match=r"ends in \.dxf; a curve is written to \.svg, \.json, \.npz.*does not exist"
+        MeshFileError, match=r"ends in \.dxf; .* a curve, written to \.svg, \.json, \.npz.*does not exist"
     ):
         write_curve(curve, tmp_path / "missing" / "curve.dxf")
     broken = replace(curve, closed=np.array([True, True]))

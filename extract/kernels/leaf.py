@@ -109,7 +109,10 @@ def substitute_output(F, N, X, J, M, system, floats, tables, target):
 
 @njit(cache=True, error_model="numpy")
 def emit_choice(F, N, X, J, M, output, tables, slot_of_tag, cell, cell_rows, system, floats):
-    """Emit the polygon of the chosen states, if the surface has one there. Returns 1 if it does, else 0."""
+    """Emit the polygon of the chosen states, if the surface has one there.
+
+    Returns 1 if the cell is too degenerate to be cut, else 0.
+    """
     rows = N[system + SYS_ROWS]
     row_unit = system + SYS_HEADER + N[system + SYS_LEVELS] + 1
     gradient = FORMS * M + 4 * rows
@@ -119,7 +122,8 @@ def emit_choice(F, N, X, J, M, output, tables, slot_of_tag, cell, cell_rows, sys
     if low >= 0.0 or high < 0.0:
         return 0
     count = find_cut_edges(F, N, X, J, M, cell, cell_rows, OUT_VALUES)
-    link_cut_edges(J, M, slot_of_tag, count)
+    if not link_cut_edges(J, M, slot_of_tag, count):
+        return 1
     polygon, tags, other, other_tags = POLY_A, TAGS_A, POLY_B, TAGS_B
     read_cut_polygon(X, J, M, count, polygon, tags)
     hash0, hash1 = N[system + SYS_HASH], N[system + SYS_HASH + 1]
@@ -146,7 +150,7 @@ def emit_choice(F, N, X, J, M, output, tables, slot_of_tag, cell, cell_rows, sys
                 return 0
             polygon, tags, other, other_tags = other, other_tags, polygon, tags
     emit_polygon(X, J, M, output, tables, count, polygon, tags, hash0, hash1, gradient)
-    return 1
+    return 0
 
 
 @njit(cache=True, error_model="numpy")
@@ -174,13 +178,13 @@ def open_choice(F, N, X, J, M, tables, cell, system, floats, r):
 
 @njit(cache=True, error_model="numpy")
 def emit_leaf(F, N, X, J, M, output, tables, slot_of_tag, cell, cell_rows, system, floats):
-    """Enumerate the states of a small folded system over a cell and emit every polygon; returns their number.
+    """Enumerate the states of a small folded system over a cell and emit every polygon.
 
     The cell's own state rows belong to another system (``cell_rows`` of them); the states of this system's rows are
-    J[STATE_LOW], J[STATE_HIGH].
+    J[STATE_LOW], J[STATE_HIGH]. Returns the number of choices for which the cell was too degenerate to be cut.
     """
     rows = N[system + SYS_ROWS]
-    emitted = 0
+    broken = 0
     r = 0
     opening = True
     while True:
@@ -188,11 +192,11 @@ def emit_leaf(F, N, X, J, M, output, tables, slot_of_tag, cell, cell_rows, syste
             while r < rows:
                 open_choice(F, N, X, J, M, tables, cell, system, floats, r)
                 r += 1
-            emitted += emit_choice(F, N, X, J, M, output, tables, slot_of_tag, cell, cell_rows, system, floats)
+            broken += emit_choice(F, N, X, J, M, output, tables, slot_of_tag, cell, cell_rows, system, floats)
             opening = False
         r -= 1
         if r < 0:
-            return emitted
+            return broken
         if J[CHOICE * M + r] < J[CHOICE_LAST * M + r]:
             J[CHOICE * M + r] += 1
             r += 1

@@ -64,7 +64,7 @@ DONE, BUDGET_USED, ARENA_FULL, SCRATCH_FULL, OUTPUT_FULL, STACK_FULL, STOPPED = 
 (STACK_BOTTOM, STACK_TOP, TOP_F, TOP_I, STOP, LEAF_CHOICES, NODES, PRUNED, LEAVES, FOLDS, WORK, NEED_F, NEED_I) = range(
     13
 )
-(CONSTANT_CELLS, DEEPEST, NEED_CORNERS, NEED_POLYGONS, CHILDREN_PRUNED, PROFILE) = range(13, 19)
+(BROKEN_CUTS, DEEPEST, NEED_CORNERS, NEED_POLYGONS, CHILDREN_PRUNED, PROFILE) = range(13, 19)
 # Per power of two of unstable units: nodes, cycles.
 PROFILE_BINS = 16
 CONTROL_SIZE = PROFILE + 2 * PROFILE_BINS
@@ -220,6 +220,7 @@ def split_cell(
 ):
     """Push both halves of a cell, less those that the output's centre and ``slack`` exclude.
 
+    A cell too degenerate to be cut is given up and counted; if the surface passes through it, its edges stay unmatched.
     ``form`` is the row that the splitting pre-activation has in X, ``row`` the one it has in ``system``.
     """
     unit = N[system + SYS_HEADER + N[system + SYS_LEVELS] + 1 + row]
@@ -228,7 +229,9 @@ def split_cell(
         F, N, X, M, cell, VALUES, X[form], X[M + form], X[2 * M + form], X[3 * M + form] - tables.knots[plane]
     )
     count = find_cut_edges(F, N, X, J, M, cell, cell_rows, VALUES)
-    link_cut_edges(J, M, slot_of_tag, count)
+    if not link_cut_edges(J, M, slot_of_tag, count):
+        control[BROKEN_CUTS] += 1
+        return
     for side in (1, 0):
         low, high = half_range(X, J, M, count, side)
         if low > slack or high < -slack:
@@ -292,9 +295,7 @@ def visit(F, N, X, J, M, control, stack, output, tables, slot_of_tag, cell):
             row = J[NEW_INDEX * M + row]
     if leaf:
         control[LEAVES] += 1
-        emit_leaf(F, N, X, J, M, output, tables, slot_of_tag, cell, rows, folded, folded_floats)
-        if low == 0.0 and high == 0.0:
-            control[CONSTANT_CELLS] += 1
+        control[BROKEN_CUTS] += emit_leaf(F, N, X, J, M, output, tables, slot_of_tag, cell, rows, folded, folded_floats)
         return
     split_cell(
         F, N, X, J, M, control, stack, tables, slot_of_tag, cell, rows, folded, folded_floats, row, form, knot, slack

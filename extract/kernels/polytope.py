@@ -101,13 +101,24 @@ def find_cut_edges(F, N, X, J, M, cell, rows, values):
 
 @njit(cache=True, error_model="numpy")
 def link_cut_edges(J, M, slot_of_tag, count):
-    """Order the corners of a cut: CUT_NEXT and CUT_PREVIOUS. ``slot_of_tag`` is scratch of one entry per tag."""
+    """Order the corners of a cut: CUT_NEXT and CUT_PREVIOUS. ``slot_of_tag`` is scratch of one entry per tag.
+
+    Returns whether the cut is one polygon (or nothing). It is, unless rounding has decided the signs at vertices that
+    nearly coincide as no plane could: then the links are of no use.
+    """
     for j in range(count):
         slot_of_tag[J[CUT_IN * M + j]] = j
     for j in range(count):
         following = slot_of_tag[J[CUT_OUT * M + j]]
         J[CUT_NEXT * M + j] = following
         J[CUT_PREVIOUS * M + following] = j
+    j, met = 0, 0
+    while met < count and 0 <= j < count:
+        j = J[CUT_NEXT * M + j]
+        met += 1
+        if j == 0:
+            break
+    return count == 0 or (j == 0 and met == count and count >= 3)
 
 
 @njit(cache=True, error_model="numpy")
