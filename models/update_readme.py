@@ -1,19 +1,18 @@
 """Write the generated tables of the README: which operators are supported, and what the networks here measure.
 
 python models/update_readme.py operators
-python models/update_readme.py measurements
+python models/update_readme.py measurements (on a machine with nothing else to do; needs the extra `bench`)
 """
 
 from __future__ import annotations
 
-import os
-import platform
 import re
 import sys
 from collections.abc import Callable
 from pathlib import Path
 
-import mn_onnx
+from mn_onnx.bench import run_bench
+from mn_onnx.bench.table import markdown
 from mn_onnx.operators import operator_table
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -22,23 +21,12 @@ MEASURED = ("bunny_relu_d3_w128", "bunny_relu_d4_w128", "am_chair", "niq_fox")
 
 
 def measurement_table() -> str:
-    """Extract the ReLU networks of this folder, and tabulate counts, residuals and times."""
-    lines = [
-        f"mn-onnx {mn_onnx.__version__} on {os.cpu_count()} cores ({platform.machine()}), box [-1, 1]^3.",
-        "",
-        "| network | polygons | vertices | components | Euler | max abs(f) | traverse, s | weld, s | per polygon, us |",
-        "|---|---|---|---|---|---|---|---|---|",
-    ]
-    for name in MEASURED:
-        report = mn_onnx.extract(ROOT / "models" / f"{name}.onnx").report
-        seconds = report["seconds"]
-        pace = 1e6 * (seconds["traverse"] + seconds["weld"]) / report["polygons"]
-        lines.append(
-            f"| `{name}` | {report['polygons']:,} | {report['vertices']:,} | {report['components']} "
-            f"| {report['euler']} | {report['max_abs_f']:.1e} "
-            f"| {seconds['traverse']:.2f} | {seconds['weld']:.2f} | {pace:.1f} |"
-        )
-    return "\n".join(lines)
+    """Measure the ReLU networks of this folder against marching cubes."""
+    result = run_bench([ROOT / "models" / f"{name}.onnx" for name in MEASURED], on_start=print)
+    failures = [f"{model.model}: {failure}" for model in result.models for failure in model.failures]
+    if failures:
+        sys.exit("\n".join(failures))
+    return markdown(result)
 
 
 TABLES: dict[str, Callable[[], str]] = {"operators": operator_table, "measurements": measurement_table}
