@@ -188,7 +188,7 @@ def _pack_box(
             tags[v, i] = 2 * (n_knots + 2 * axis + corner[axis])
             neighbours[v, i] = v ^ (1 << axis)
     levels = network.unit_level[order]
-    pieces = np.array([network.units[g].table.knots.size for g in order], np.int64)  # type: ignore[union-attr]
+    pieces = np.array([network.units[g].table.knots.size for g in order], np.int64)
     padded_pieces = []
     for level in range(int(levels.max()) + 1 if levels.size else 0):
         members = pieces[levels == level]

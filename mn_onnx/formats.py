@@ -85,16 +85,18 @@ def _as_text(data: bytes) -> str | None:
 
 def _decode_text(text: str, name: str) -> onnx.ModelProto:
     start = text.lstrip()[:1]
+    model = onnx.ModelProto()
     try:
-        if start == "{":
-            model: onnx.ModelProto = json_format.Parse(text, onnx.ModelProto())
-            return model
         if start == "<":
             return onnx.parser.parse_model(text)
-        return text_format.Parse(text, onnx.ModelProto())
+        if start == "{":
+            json_format.Parse(text, model)
+        else:
+            text_format.Parse(text, model)
     except (json_format.ParseError, text_format.ParseError, onnx.parser.ParseError) as error:
         reason = f"this text file is no ONNX model ({_first_line(error)})"
         raise _refused(name, reason, "pass a file written by an ONNX exporter") from error
+    return model
 
 
 def _decode_binary(data: bytes, name: str) -> onnx.ModelProto:
@@ -103,7 +105,7 @@ def _decode_binary(data: bytes, name: str) -> onnx.ModelProto:
             name, "the file has more than 2 GiB, the limit of protobuf", "store the weights as external data"
         )
     try:
-        model = onnx.ModelProto.FromString(data)
+        model: onnx.ModelProto = onnx.ModelProto.FromString(data)
     except DecodeError as error:
         reason = f"the file is damaged, cut off, or not an ONNX model ({_first_line(error)})"
         raise _refused(name, reason, "export or download it again") from error

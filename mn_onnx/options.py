@@ -89,7 +89,7 @@ def _parse_numbers(text: str, value: str) -> Floats:
         numbers = [float(part) for part in value.split(",")]
     except ValueError as error:
         raise UsageError(f"--bind {text}: {value!r} is neither numbers nor a .npy file") from error
-    return np.float64(numbers[0]).reshape(()) if len(numbers) == 1 else np.asarray(numbers, np.float64)
+    return np.array(numbers[0] if len(numbers) == 1 else numbers, np.float64)
 
 
 def coordinates(text: str | None) -> list[int | str] | None:

@@ -22,7 +22,7 @@ BISECTIONS = 20
 BATCH_SIZES = (1, 2, 7)
 """Besides one large batch: a network whose value at a point depends on the other points differs between them."""
 
-UNIT_ROUNDOFF = {
+UNIT_ROUNDOFF: dict[int, float] = {
     onnx.TensorProto.FLOAT: 2.0**-24,
     onnx.TensorProto.FLOAT16: 2.0**-11,
     onnx.TensorProto.BFLOAT16: 2.0**-8,

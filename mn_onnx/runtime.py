@@ -106,8 +106,9 @@ def _reference(model: onnx.ModelProto, output: str, note: str) -> Run:
 
     def run(feeds: Feeds) -> Mapping[str, NDArray[Any]]:
         try:
-            return {output: evaluator.run([output], feeds)[0]}
+            values = list(evaluator.run([output], feeds))
         except refusals as error:
             raise CheckFailed([f"{note}, and onnx.reference stopped ({error}); {_REMEDY}"]) from error
+        return {output: values[0]}
 
     return run
