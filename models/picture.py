@@ -25,7 +25,7 @@ RESOLUTION = 64
 # Orthographic view: right, up and towards the eye, as rows.
 VIEW = np.array([[0.94, 0.0, 0.34], [-0.1, 0.96, 0.27], [-0.33, -0.29, 0.9]])
 LIGHT = np.array([-0.35, 0.6, 0.72])
-WHOLE = (-0.85, 1.05, -0.95, 0.95)
+WHOLE = (-0.99, 1.07, -1.01, 1.05)
 DETAIL = (-0.33, 0.05, 0.47, 0.85)
 
 
