@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import signal
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -18,8 +19,10 @@ import mn_onnx
 from mn_onnx.bench import cubes, extras
 from mn_onnx.bench.quality import soft_precision, soft_recall
 from mn_onnx.bench.result import BenchResult, Measurement, ModelResult
+from mn_onnx.bench.run import in_fresh_process
 from mn_onnx.bench.sampler import fastest, open_runtime
 from mn_onnx.bench.table import markdown
+from mn_onnx.bench.worker import Failure, Job
 from mn_onnx.cli import EXIT_CHECK, EXIT_USAGE, main
 from mn_onnx.runtime import Runtime
 
@@ -222,6 +225,23 @@ def test_what_fails_is_told_beside_what_was_measured(
     assert [entry["resolution"] for entry in model["measurements"]] == [8]
     assert len(model["failures"]) == 1
     assert model["ratios"] == {}
+
+
+class Deadly:
+    """Ends the process that receives it."""
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return signal.raise_signal, (signal.SIGKILL,)
+
+
+def test_a_process_that_dies_is_a_failure() -> None:
+    job = Job("gone.onnx", {"level": Deadly()}, 8, 1, 1, 100, None, None)  # type: ignore[typeddict-item]
+    outcome = in_fresh_process(job)
+    assert isinstance(outcome, Failure)
+    assert (
+        outcome.reason
+        == "marching cubes 8^3: the process ended with code -9: it was killed, perhaps for lack of memory"
+    )
 
 
 def test_the_readme_table_has_a_row_per_model() -> None:

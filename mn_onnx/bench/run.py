@@ -5,11 +5,10 @@ from __future__ import annotations
 import os
 import platform
 from collections.abc import Callable, Sequence
-from concurrent.futures import ProcessPoolExecutor
-from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, field
 from importlib.metadata import version
 from multiprocessing import get_context
+from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
@@ -83,7 +82,7 @@ def run_bench(
             )
             if on_start is not None:
                 on_start(f"{path.name}: {job.title}")
-            outcomes.append(_in_fresh_process(job))
+            outcomes.append(in_fresh_process(job))
         measurements = [outcome for outcome in outcomes if isinstance(outcome, Measurement)]
         failures = [outcome.reason for outcome in outcomes if isinstance(outcome, Failure)]
         results.append(ModelResult(path.name, sha256, measurements, failures))
@@ -125,12 +124,27 @@ def _check_models(paths: Sequence[Path], options: LoadOptions) -> list[str]:
     return hashes
 
 
-def _in_fresh_process(job: Job) -> Measurement | Failure:
-    with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
-        try:
-            return pool.submit(measure, job).result()
-        except BrokenProcessPool:
-            return Failure(f"{job.title}: the process was ended from outside, probably for lack of memory")
+def in_fresh_process(job: Job) -> Measurement | Failure:
+    """Carry out ``job`` in a new process, which is ended when this one is interrupted."""
+    context = get_context("spawn")
+    receiver, sender = context.Pipe(duplex=False)
+    process = context.Process(target=_send_measurement, args=(sender, job), daemon=True)
+    process.start()
+    sender.close()  # the child holds the only other end: when it dies, there is nothing more to receive
+    try:
+        outcome: Measurement | Failure = receiver.recv()
+    except EOFError:
+        process.join()
+        cause = "it was killed, perhaps for lack of memory" if (process.exitcode or 0) < 0 else "see the message above"
+        return Failure(f"{job.title}: the process ended with code {process.exitcode}: {cause}")
+    finally:
+        process.terminate()  # on an interrupt
+        process.join()
+    return outcome
+
+
+def _send_measurement(sender: Connection, job: Job) -> None:
+    sender.send(measure(job))
 
 
 def _machine() -> dict[str, Any]:
