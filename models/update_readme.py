@@ -46,7 +46,8 @@ def main() -> None:
     if len(sys.argv) < 2 or not set(sys.argv[1:]) <= TABLES.keys():
         sys.exit(f"usage: python models/update_readme.py {' | '.join(TABLES)}")
     for name in sys.argv[1:]:
-        README.write_text(with_table(README.read_text(), name, TABLES[name]()))
+        table = TABLES[name]()  # takes minutes: the README is read after
+        README.write_text(with_table(README.read_text(), name, table))
 
 
 if __name__ == "__main__":
