@@ -15,7 +15,7 @@ from mn_onnx.runtime import Runtime
 
 Floats = NDArray[np.float64]
 
-BATCHES = (1 << 12, 1 << 13, 1 << 14, 1 << 15, 1 << 16)
+BATCHES = (1 << 10, 1 << 11, 1 << 12, 1 << 13, 1 << 14, 1 << 16)
 """Points per call to choose from: what a call costs and what the processor's caches hold differ by machine."""
 _TRIAL_POINTS = 1 << 17
 _COMPARED_POINTS = 64
