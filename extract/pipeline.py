@@ -103,9 +103,9 @@ def extract_surface(
 ) -> Extraction:
     """The level set f = 0 of a canonical network in the open box ``lower``..``upper`` (float64 [3] each).
 
-    The surface is the boundary of {f < 0}: a polygon that lies in a face of the box is no part of it, and of a region
-    where f is zero throughout only the border with f < 0 is. Where {f < 0} touches itself in a point or an edge, the
-    mesh has vertices for each of the parts that touch.
+    The surface is the boundary of {f < 0}: a polygon that lies in a face of the box is no part of it (unless there are
+    no others: a solid that fills the box), and of a region where f is zero throughout only the border with f < 0 is.
+    Where {f < 0} touches itself in a point or an edge, the mesh has vertices for each of the parts that touch.
 
     A network in general position is traversed once, as it is. Where planes coincide or meet by design, the mesh is that
     of a perturbed network in the limit of no perturbation (see `mn_onnx.extract.limit`). If no perturbation gives a
@@ -218,8 +218,9 @@ def _cleaned(surface: Surface, run: _Run, length: float, degeneracy: Degeneracy)
             merged_vertices=contraction.merged_vertices,
             removed_polygons=contraction.removed_polygons,
         )
-    surface, box_copies = drop_box_copies(surface, run.lower, run.upper, run.coincidence)
-    return surface, replace(degeneracy, box_copies=box_copies)
+    inner, box_copies = drop_box_copies(surface, run.lower, run.upper, run.coincidence)
+    # A solid that fills the box has nothing but copies of its faces, and is better shown than called empty.
+    return inner if inner.n_polygons else surface, replace(degeneracy, box_copies=box_copies)
 
 
 def _perturbed(network: Network, run: _Run, size: float, seed: int) -> tuple[Surface, float] | None:
