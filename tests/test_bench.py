@@ -103,6 +103,7 @@ def test_a_table_is_printed(folder: Path, capsys: pytest.CaptureFixture[str]) ->
     arguments = ["--grids", "8", "--repeat", "1", "--samples", "100", "--threads", "1"]
     assert main(["bench", str(folder / "octahedron.onnx"), *arguments]) == 0
     out = capsys.readouterr().out
+    assert "…" not in out  # eighty columns suffice
     for words in ("octahedron.onnx, 1 threads, median of 1", "marching cubes 8^3", "exact: traverse", "before: import"):
         assert words in out
 

@@ -13,7 +13,8 @@ def print_result(result: BenchResult, console: Console) -> None:
     """One table per model, and below it how the methods compare and what failed."""
     for model in result.models:
         console.print(_table(result, model))
-        lines = [_phases(entry) for entry in model.measurements]
+        lines = ["ratio: seconds of exact extraction to those of the row; memory: the peak of the whole process"]
+        lines += [_phases(entry) for entry in model.measurements]
         lines += [f"{entry.title}: {entry.note}" for entry in model.measurements if entry.note]
         for line in (*lines, *model.failures):
             console.print(f"  {line}", markup=False, highlight=False, soft_wrap=True)
@@ -22,7 +23,7 @@ def print_result(result: BenchResult, console: Console) -> None:
 def _table(result: BenchResult, model: ModelResult) -> Table:
     with_recall = any(entry.soft_recall is not None for entry in model.measurements)
     table = Table(title=f"{model.model}, {result.threads} threads, median of {result.repeat}", title_justify="left")
-    heads = ["method", "seconds", "exact : this", "memory", "triangles", "mean |f|"]
+    heads = ["method", "seconds", "ratio", "memory", "triangles", "mean |f|"]
     for head in [*heads, "recall"] if with_recall else heads:
         table.add_column(head, justify="left" if head == "method" else "right", no_wrap=True)
     for entry in model.measurements:
