@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from onnx.reference import ReferenceEvaluator
 from onnxruntime.capi import onnxruntime_pybind11_state as ort_errors
 
-from mn_onnx.errors import CheckFailed
+from mn_onnx.errors import CheckFailed, ModelRefused, Problem
 from mn_onnx.layout import Feeds, Layout
 from mn_onnx.reader import ReadModel
 
@@ -40,14 +40,14 @@ class Runtime:
     """Evaluates the model as it was stored, at points. ``name`` says by which program; ``note`` why not onnxruntime.
 
     ``threads``: for onnxruntime, its own choice by default. ``most_points``: how many it evaluates in reasonable time.
-    Raises `CheckFailed` where no program can load the model.
+    Raises `CheckFailed` where no program can load the model, `ModelRefused` where it takes too many points at once.
     """
 
     def __init__(self, read: ReadModel, layout: Layout, *, threads: int | None = None) -> None:
         if layout.batch is not None and layout.batch > CHUNK:
-            raise CheckFailed(
-                [f"the model takes {layout.batch:,} points at once, too many to run it for comparison; {_REMEDY}"]
-            )
+            reason = f"takes {layout.batch:,} points at once, too many to run it for comparison"
+            remedy = f"export it with a free batch axis or a batch of at most {CHUNK:,} points; {_REMEDY}"
+            raise ModelRefused([Problem("", "", 0, reason, remedy)])
         self._layout = layout
         self.most_points = CALLS * (layout.batch or CHUNK)
         self.note = ""
