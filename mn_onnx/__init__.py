@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from mn_onnx.extraction import extract
     from mn_onnx.model import Model, load
     from mn_onnx.planar import PlanarLevelSet, extract_planar
+    from mn_onnx.torch_modules import from_torch
 
 __version__ = "0.1.0"
 
@@ -32,6 +33,7 @@ _HOMES = {
     "Surface": "mn_onnx.extract.surface",
     "UsageError": "mn_onnx.errors",
     "extract_planar": "mn_onnx.planar",
+    "from_torch": "mn_onnx.torch_modules",
     "load": "mn_onnx.model",
     "read_mesh": "mn_onnx.extract.files",
     "write_mesh": "mn_onnx.extract.files",
@@ -48,6 +50,7 @@ __all__ = [
     "UsageError",
     "extract",
     "extract_planar",
+    "from_torch",
     "load",
     "read_mesh",
     "write_mesh",

@@ -98,6 +98,21 @@ def _add_extract(commands: argparse._SubParsersAction[argparse.ArgumentParser]) 
         "--triangulate", action="store_true", help="write triangles where the format could hold polygons"
     )
     parser.add_argument("--float64", action="store_true", help="write coordinates in double precision (.ply)")
+    parser.add_argument(
+        "--attributes",
+        nargs="+",
+        default=[],
+        metavar="NAME",
+        help="values per face to write (.ply): normals; of smooth networks eps (proved error), displacement",
+    )
+    parser.add_argument(
+        "--polish", action="store_true", help="move the vertices onto the level set of the true smooth network"
+    )
+    parser.add_argument(
+        "--all",
+        action="store_true",
+        help="one mesh for each row of the tables bound by --bind NAME=codes.npy; MESH may hold {:03d} for the row",
+    )
     parser.add_argument("--report", metavar="FILE.json", help="write counts, checks, times and versions as JSON")
     parser.add_argument("--no-check", action="store_true", help="write the mesh without checks against onnxruntime")
     parser.add_argument("--profile", action="store_true", help="print where the time went, on standard error")
@@ -190,13 +205,26 @@ def _add_field(parser: argparse.ArgumentParser) -> None:
         metavar="NAME=VALUE",
         help="fix another input: a number, numbers with commas, or a .npy file; repeatable",
     )
+    field.add_argument("--row", type=int, metavar="I", help="take row I of the tables that are bound")
+    field.add_argument(
+        "--sign",
+        choices=("auto", "positive-outside", "positive-inside"),
+        default="auto",
+        help="where the output is larger than the level (default: by the corners of the box)",
+    )
     field.add_argument("--coordinates", metavar="I,J,K", help="columns or inputs that are the coordinates, in order")
     smooth = parser.add_argument_group("smooth activations")
     smooth.add_argument(
         "--surrogate-tol", type=float, metavar="T", help="refine surrogates until |f_true - f| is certified at most T"
     )
     smooth.add_argument(
-        "--knots-per-period", type=int, metavar="N", help="fineness of surrogates, where no tolerance is given"
+        "--knots-per-period", type=float, metavar="N", help="fineness of surrogates, where no tolerance is given"
+    )
+    smooth.add_argument(
+        "--budget",
+        type=float,
+        metavar="N",
+        help="most polygons; without tolerance or knots surrogates are as fine as it allows (default 2.5e6)",
     )
 
 

@@ -15,6 +15,8 @@ from mn_onnx.errors import CheckFailed, ModelRefused, UsageError
 from mn_onnx.memory import parse_size
 from mn_onnx.model import LoadOptions, Model, load
 from mn_onnx.progress import ProgressCallback
+from mn_onnx.reader import read_model
+from mn_onnx.series import count_rows, numbered, row_of
 
 
 def run_extract(options: argparse.Namespace) -> int:
@@ -22,11 +24,14 @@ def run_extract(options: argparse.Namespace) -> int:
 
     Raises `CheckFailed`, after the report is written, if a check fails or the level set is empty; no mesh is then left.
     """
+    from mn_onnx.extract.blocks import resolve_threads
     from mn_onnx.extract.files import MeshFileError, check_mesh_options, write_mesh
     from mn_onnx.extraction import extract
     from mn_onnx.profile import profile_text
     from mn_onnx.progress import ProgressEvent, TerminalProgress
 
+    if options.all:
+        return _extract_rows(options)
     if options.report is not None:
         _check_parent("--report", Path(options.report))
     with TerminalProgress(enabled=not options.quiet) as progress:
@@ -34,8 +39,10 @@ def run_extract(options: argparse.Namespace) -> int:
         model = load(options.model, **_load_options(options))
         if model.dimension < 3:
             return _extract_planar(options, model, progress)
+        if model.fineness is not None and not options.quiet:
+            print(f"mn-onnx: {model.fineness.cost(resolve_threads(options.threads))}", file=sys.stderr)
         try:
-            check_mesh_options(options.mesh, float64=options.float64)
+            check_mesh_options(options.mesh, float64=options.float64, attributes=options.attributes)
         except MeshFileError as error:
             raise UsageError(str(error)) from error
         try:
@@ -44,6 +51,7 @@ def run_extract(options: argparse.Namespace) -> int:
                 threads=options.threads,
                 check=not options.no_check,
                 max_memory=_max_memory(options),
+                polish=options.polish,
                 progress=progress,
             )
         except CheckFailed as error:
@@ -57,7 +65,13 @@ def run_extract(options: argparse.Namespace) -> int:
         progress(ProgressEvent("write"))
         started = time.perf_counter()
         try:
-            write_mesh(surface, options.mesh, float64=options.float64, triangulate=options.triangulate)
+            write_mesh(
+                surface,
+                options.mesh,
+                float64=options.float64,
+                triangulate=options.triangulate,
+                attributes=options.attributes,
+            )
         except OSError as error:
             raise UsageError(f"cannot write {options.mesh}: {error.strerror or error}") from error
         report["seconds"] = {**report["seconds"], "write": time.perf_counter() - started}
@@ -68,6 +82,26 @@ def run_extract(options: argparse.Namespace) -> int:
         print(profile_text(report), file=sys.stderr)
     if not options.quiet:
         print(_summary(options.mesh, report))
+    return 0
+
+
+def _extract_rows(options: argparse.Namespace) -> int:
+    """`run_extract` once for every row of the bound tables, of a model that is read once."""
+    bound = parse.bindings(options.bind)
+    n_rows = count_rows(bound)
+    read = read_model(options.model)
+    failures = []
+    for row in range(n_rows):
+        single = argparse.Namespace(**vars(options))
+        single.all, single.row, single.model = False, row, read
+        single.mesh = numbered(options.mesh, row, n_rows)
+        single.report = None if options.report is None else numbered(options.report, row, n_rows)
+        try:
+            run_extract(single)
+        except CheckFailed as error:
+            failures += [f"row {row}: {problem}" for problem in error.problems]
+    if failures:
+        raise CheckFailed(failures)
     return 0
 
 
@@ -200,14 +234,17 @@ def _max_memory(options: argparse.Namespace) -> int | None:
 
 
 def _load_options(options: argparse.Namespace) -> LoadOptions:
+    bound = parse.bindings(options.bind)
     return {
         "output": options.output,
         "level": options.level,
         "bounds": options.bounds,
-        "bind": parse.bindings(options.bind),
+        "bind": bound if options.row is None else row_of(bound, options.row),
         "coordinates": parse.coordinates(options.coordinates),
         "surrogate_tol": options.surrogate_tol,
         "knots_per_period": options.knots_per_period,
+        "budget": options.budget,
+        "sign": options.sign,
     }
 
 
@@ -237,6 +274,18 @@ def _print_json(value: Any) -> None:
     print(json.dumps(value, indent=2, allow_nan=False))
 
 
+def _polish_line(polish: dict[str, Any]) -> str:
+    held = f"; {polish['held_vertices']:,} vertices held back so that no face turns over" * bool(
+        polish["held_vertices"]
+    )
+    stray = f"; {polish['stray_vertices']:,} found no root in reach" * bool(polish["stray_vertices"])
+    return (
+        f"  polished: mean |f_true| at vertices {polish['mean_abs_f_before']:.2g} before, {polish['mean_abs_f']:.2g} "
+        f"after (max {polish['max_abs_f']:.2g}), on faces {polish['true_mean_abs_f']:.2g}; moved by up to "
+        f"{polish['largest_move']:.2g}{held}{stray}"
+    )
+
+
 def _summary(mesh: str, report: dict[str, Any]) -> str:
     """A few lines about a mesh."""
     if report["unmatched_edges"]:
@@ -258,6 +307,14 @@ def _summary(mesh: str, report: dict[str, Any]) -> str:
             if report["true_mean_abs_f"] is not None
             else f"  surrogates within {report['surrogate_eps']:.2g} of the true network"
         )
+    if report.get("surface_eps") is not None:
+        lines.append(
+            f"  on the mesh |f_true - f| is certified at most {report['surface_eps']:.2g} (median "
+            f"{report['surface_eps_median']:.2g}); to first order the true surface is within "
+            f"{report['displacement']:.2g} (median {report['displacement_median']:.2g})"
+        )
+    if report.get("polish") is not None:
+        lines.append(_polish_line(report["polish"]))
     if report["parity_runtime"] is not None:
         lines.append(
             f"  {report['parity_runtime']}: differs by {report['parity_max_abs_err']:.2g} "

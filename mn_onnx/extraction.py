@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from typing import Unpack
+from typing import Any, Unpack
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,8 +22,9 @@ from mn_onnx.parity import Parity, check_parity
 from mn_onnx.progress import ProgressCallback, ProgressEvent
 from mn_onnx.reader import ModelSource
 from mn_onnx.report import build_report
-from mn_onnx.residual import Residuals, measure_residuals
+from mn_onnx.residual import Residuals, measure_residuals, true_residuals
 from mn_onnx.runtime import Runtime
+from mn_onnx.surrogates import NOT_CERTIFIED, certified, polished
 from mn_onnx.warmup import warm_up
 
 DIMENSION = 3
@@ -55,6 +56,7 @@ def extract(
     threads: int | None = None,
     check: bool = True,
     max_memory: int | None = None,
+    polish: bool = False,
     progress: ProgressCallback | None = None,
     **options: Unpack[LoadOptions],
 ) -> Surface:
@@ -63,10 +65,12 @@ def extract(
     ``source``: a `Model` from `load`, or what `load` takes (path, bytes or message), with ``options`` as there.
     ``threads``: all cores by default; the mesh does not depend on it. ``check``: compare the imported network with
     onnxruntime before, and measure the mesh after. ``max_memory``: most bytes that the process may occupy, by default
-    what it has and 80 % of what is available. ``progress``: called with a `ProgressEvent` a few times a second.
+    what it has and 80 % of what is available. ``polish``: move the vertices of a smooth network's mesh onto the level
+    set of the true network; the topology stays. ``progress``: called with a `ProgressEvent` a few times a second.
 
     Returns a `Surface`: ``vertices`` float64 [v, 3], polygons oriented towards growing f, and ``report``, whose keys
-    `mn_onnx.report` lists. An empty level set is a surface without polygons.
+    `mn_onnx.report` lists. ``errors`` are proved bounds on |f_true - f| on each polygon (before polishing), zero for
+    exact networks. An empty level set is a surface without polygons.
 
     Raises `UsageError` and `ModelRefused` as `load`; `CheckFailed` with every failed check (``error.surface`` is the
     mesh, if there is one already); `MemoryLimitReached` if the mesh would not fit in ``max_memory``.
@@ -112,6 +116,14 @@ def extract(
         invariants = check_invariants(surface, bounds=model.bounds)
         if check and surface.n_polygons and invariants.area > 0:
             residuals = measure_residuals(model, surface, runtime)
+    certificate, polish_entries = dict[str, Any](NOT_CERTIFIED), None
+    if not model.exact and surface.n_polygons:
+        with phases.phase("certify"):
+            surface, certificate = certified(surface, model.canonical, threads=threads)
+    if polish and not model.exact and surface.n_polygons:
+        with phases.phase("polish"):
+            surface, polish_entries = polished(surface, model.canonical, threads=threads)
+            polish_entries |= true_residuals(model, surface)
     problems, notes = findings(model, found, invariants, parity, residuals)
     report = build_report(
         model,
@@ -119,6 +131,8 @@ def extract(
         invariants=invariants,
         parity=parity,
         residuals=residuals,
+        certificate=certificate,
+        polish=polish_entries,
         seconds=phases.seconds,
         problems=problems,
         notes=notes,

@@ -16,9 +16,11 @@ from mn_onnx.importer import Imported, import_network
 from mn_onnx.ir.bounds import output_bounds
 from mn_onnx.ir.evaluate import evaluate
 from mn_onnx.ir.network import Network
-from mn_onnx.ir.passes import Canonical, PassFailed, ToleranceNotReached, canonicalize
+from mn_onnx.ir.passes import Canonical, PassFailed, ToleranceNotReached
 from mn_onnx.options import DEFAULT_BOUNDS, bounds_from_metadata, box, output_and_channel
 from mn_onnx.reader import ModelSource, ReadModel, read_model
+from mn_onnx.sign import oriented, resolve_sign
+from mn_onnx.surrogates import Fineness, canonical_within_budget
 
 Floats = NDArray[np.float64]
 
@@ -34,6 +36,9 @@ class LoadOptions(TypedDict, total=False):
     ``coordinates``: which columns of the input are the point, if it has more.
     ``surrogate_tol``: refine the surrogates of smooth activations until |f_true - f| is certified to be at most this.
     ``knots_per_period``: how finely surrogates follow smooth activations, if no tolerance is given.
+    ``budget``: the most polygons that a smooth network may give, as far as foretold: without tolerance or knots the
+    surrogates are as fine as it allows.
+    ``sign``: ``positive-outside``, ``positive-inside``, or ``auto``: by the values at the corners of the box.
     """
 
     output: str | None
@@ -42,7 +47,9 @@ class LoadOptions(TypedDict, total=False):
     bind: Mapping[str, ArrayLike] | None
     coordinates: Sequence[int | str] | None
     surrogate_tol: float | None
-    knots_per_period: int | None
+    knots_per_period: float | None
+    budget: float | None
+    sign: str | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,7 +58,10 @@ class Model:
 
     ``read``: the ONNX model. ``imported``: what it computes, with the true activations, and how its inputs are fed.
     ``canonical``: the piecewise-linear network whose level set f = 0 is asked for. ``level``: the value of the original
-    output there. ``lower``, ``upper``: float64 [dimension], the box. ``seconds``: time per phase.
+    output there. ``lower``, ``upper``: float64 [dimension], the box. ``seconds``: time per phase. ``sign``:
+    ``positive-outside`` or ``positive-inside``, where the output is larger; the canonical f grows outwards.
+    ``bounds_from``: where the box is from, ``option``, ``metadata`` or ``default``. ``fineness``: of a smooth network,
+    with the expected cost; None for an exact one.
     """
 
     read: ReadModel
@@ -61,6 +71,9 @@ class Model:
     lower: Floats
     upper: Floats
     seconds: Mapping[str, float]
+    sign: str
+    bounds_from: str
+    fineness: Fineness | None
 
     @property
     def network(self) -> Network:
@@ -100,10 +113,11 @@ class Model:
         return evaluate(self.imported.network, np.asarray(points, np.float64), true_functions=True)
 
 
-def load(source: ModelSource, **options: Unpack[LoadOptions]) -> Model:
+def load(source: ModelSource | ReadModel, **options: Unpack[LoadOptions]) -> Model:
     """Read an ONNX model and bring it into canonical form.
 
-    ``source``: a path, the bytes of a file, or an `onnx.ModelProto`. ``options``: see `LoadOptions`.
+    ``source``: a path, the bytes of a file, or an `onnx.ModelProto`; or a model that `read_model` has read already.
+    ``options``: see `LoadOptions`.
 
     Raises `UsageError` for wrong options and unreadable paths, `ModelRefused` with every reason if the model is damaged
     or holds what cannot be extracted.
@@ -116,7 +130,10 @@ def load(source: ModelSource, **options: Unpack[LoadOptions]) -> Model:
         raise UsageError(f"knots_per_period must be at least 1, not {knots}")
     if tolerance is not None and not 0 < tolerance < np.inf:
         raise UsageError(f"surrogate_tol must be a positive number, not {tolerance}")
-    read = read_model(source)
+    budget = options.get("budget")
+    if budget is not None and not budget >= 1:
+        raise UsageError(f"budget must be at least 1 polygon, not {budget}")
+    read = source if isinstance(source, ReadModel) else read_model(source)
     output, channel = output_and_channel(options.get("output"), [value.name for value in read.model.graph.output])
     imported = import_network(
         read.model,
@@ -125,24 +142,32 @@ def load(source: ModelSource, **options: Unpack[LoadOptions]) -> Model:
         bind=options.get("bind"),
         coordinates=options.get("coordinates"),
     )
-    bounds = options.get("bounds")
+    bounds, bounds_from = options.get("bounds"), "option"
     if bounds is None:
-        bounds = bounds_from_metadata(imported.metadata) or DEFAULT_BOUNDS
+        bounds, bounds_from = bounds_from_metadata(imported.metadata), "metadata"
+    if bounds is None:
+        bounds, bounds_from = DEFAULT_BOUNDS, "default"
     lower, upper = box(bounds, imported.input_dim)
     read_in = time.perf_counter()
     try:
-        canonical = canonicalize(
+        canonical, fineness = canonical_within_budget(
             imported.network,
             lower=lower,
             upper=upper,
             level=level,
             surrogate_tol=tolerance,
             knots_per_period=knots,
+            budget=budget,
         )
     except PassFailed as error:
         remedy = "choose smaller --bounds, or export the network with activations that are defined everywhere"
         raise ModelRefused([Problem("", "", 0, str(error), remedy)]) from error
     except ToleranceNotReached as error:
         raise UsageError(f"--surrogate-tol {tolerance:g} cannot be certified: {error}") from error
+    sign = resolve_sign(canonical, options.get("sign"))
     seconds = {"import": read_in - started, "lower": time.perf_counter() - read_in}
-    return Model(read, imported, canonical, level, lower, upper, seconds)
+    model = Model(read, imported, oriented(canonical, sign), level, lower, upper, seconds, sign, bounds_from, fineness)
+    if not canonical.empty_reason and model.output_range == (0.0, 0.0):
+        reason = f"the output is {level:g}, the level, everywhere in the box: there is no surface"
+        raise ModelRefused([Problem("", "", 0, reason, "check the weights, or choose another --level or --output")])
+    return model

@@ -3,7 +3,14 @@
 Its keys:
 
 - ``model``, ``model_sha256``, ``output``, ``level``, ``bounds``, ``threads``, ``versions``: what was extracted by what;
+- ``sign``: positive-outside or positive-inside; ``bounds_from``: option, metadata or default;
 - ``exact``, and ``surrogate_eps``: a proved bound on |f_true - f| in the box, zero for exact networks;
+- ``knots_per_period`` and ``forecast_polygons`` of the surrogates, null for exact networks;
+- ``surface_eps``, ``surface_eps_median``: the proved bound on the polygons of the mesh; ``displacement``,
+  ``displacement_median``: that over the slope, how far the true level set may be to first order, where the slope is at
+  least a tenth of the median one (``shallow_polygons`` are the others); null for exact networks;
+- ``polish``: what moving the vertices onto the true level set did (`mn_onnx.extract.polish.Polish`), and
+  ``true_max_abs_f``, ``true_mean_abs_f`` on its faces; null where not asked for;
 - ``output_range``: the certified range of the piecewise-linear f, which is zero on the level set, in the box;
 - ``polygons``, ``vertices``, ``edges``, ``euler``, ``components``, ``closed`` (every edge inside the box joins two
   polygons), ``boundary_edges`` (on the box), ``unmatched_edges``, and the other values of `Invariants`;
@@ -45,7 +52,11 @@ def model_entries(model: Model) -> dict[str, Any]:
         "level": model.level,
         "bounds": model.bounds.tolist(),
         "exact": model.exact,
+        "sign": model.sign,
+        "bounds_from": model.bounds_from,
         "surrogate_eps": model.surrogate_eps,
+        "knots_per_period": model.fineness.knots_per_period if model.fineness else None,
+        "forecast_polygons": round(model.fineness.forecast.pieces) if model.fineness else None,
         "output_range": list(model.output_range),
         "versions": versions(),
     }
@@ -77,6 +88,8 @@ def build_report(
     invariants: Invariants,
     parity: Parity | None,
     residuals: Residuals | None,
+    certificate: Mapping[str, Any],
+    polish: Mapping[str, Any] | None,
     seconds: Mapping[str, float],
     problems: Sequence[str],
     notes: Sequence[str],
@@ -87,6 +100,8 @@ def build_report(
         **model_entries(model),
         **invariants.as_dict(),
         **check_entries(parity, residuals),
+        **certificate,
+        "polish": None if polish is None else dict(polish),
         "nodes": statistics.nodes,
         "threads": statistics.threads,
         "traversal": {**asdict(statistics), "profile": profile_entries(statistics.profile)},

@@ -90,6 +90,13 @@ def measure_residuals(
     )
 
 
+def true_residuals(model: Model, surface: Surface, *, seed: int = 0) -> dict[str, float]:
+    """``true_max_abs_f`` and ``true_mean_abs_f``: |output - level| of the original network at points of the faces."""
+    points, _ = sample_surface(surface, FACE_SAMPLES, seed=seed)
+    true = np.abs(model.evaluate(points) - model.level)
+    return {"true_max_abs_f": float(true.max()), "true_mean_abs_f": float(true.mean())}
+
+
 class _Probe(NamedTuple):
     """Points float64 [n, dimension], and a bound of |grad f| around each, float64 [n]."""
 
