@@ -1,0 +1,65 @@
+"""Proved errors of polygons against what sampling finds."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from ir_networks import ELU, RELU, SILU, SINE, dense, softplus
+from smooth_models import HIGH, LOW, extracted
+
+from mn_onnx.extract.face_errors import polygon_errors, surface_errors
+from mn_onnx.extract.surface import Surface
+from mn_onnx.ir.evaluate import evaluate
+from mn_onnx.ir.expression import Expression
+from mn_onnx.ir.network import Floats, Network
+from mn_onnx.ir.passes import canonicalize
+
+PER_POLYGON = 40
+SMALL_BOX = (np.full(3, -0.25), np.full(3, 0.25))
+
+
+def largest_differences(network: Network, surface: Surface) -> Floats:
+    """The largest |f_true - f| seen at corners and random points of each polygon, [p]."""
+    rng = np.random.default_rng(0)
+    points = []
+    for begin, end in zip(surface.offsets[:-1], surface.offsets[1:], strict=True):
+        corners = surface.vertices[surface.corners[begin:end]]
+        inside = rng.dirichlet(np.full(len(corners), 0.5), PER_POLYGON - 1)
+        points.append(np.concatenate([inside @ corners, corners[:1]]))
+    together = np.concatenate(points)
+    difference = np.abs(evaluate(network, together, true_functions=True) - evaluate(network, together))
+    return np.asarray(difference.reshape(-1, PER_POLYGON).max(axis=1))
+
+
+@pytest.mark.parametrize("function", [SINE, SILU, ELU, softplus(20.0)], ids=["sine", "silu", "elu", "softplus"])
+@pytest.mark.parametrize("knots", [3.0, 6.0])
+def test_bounds_hold_and_are_close(function: Expression, knots: float) -> None:
+    low, high = SMALL_BOX if function is SINE else (LOW, HIGH)
+    canonical, surface = extracted(dense([5, 5, 4], function, seed=2), knots=knots, lower=low, upper=high)
+    assert surface.n_polygons > 4
+    errors = surface_errors(canonical.network, surface, low, high, threads=1)
+    seen = largest_differences(canonical.network, surface)
+    assert (seen <= errors).all()
+    assert np.median(errors / seen) < 10
+
+
+def test_threads_do_not_change_bounds() -> None:
+    low, high = SMALL_BOX
+    canonical, surface = extracted(dense([5, 4], SINE, seed=3), knots=4, lower=low, upper=high)
+    one, two = (surface_errors(canonical.network, surface, low, high, threads=threads) for threads in (1, 2))
+    np.testing.assert_array_equal(one, two)
+
+
+def test_exact_networks_have_no_error() -> None:
+    canonical, surface = extracted(dense([6, 6], RELU, seed=1), knots=8)
+    assert not surface_errors(canonical.network, surface, LOW, HIGH).any()
+
+
+def test_segments_in_two_dimensions() -> None:
+    network = dense([6], SINE, seed=5, dimension=2)
+    table = canonicalize(network, lower=LOW[:2], upper=HIGH[:2], knots_per_period=6).network
+    point = np.array([[0.21, -0.4]])
+    error = polygon_errors(table, point, np.array([0, 2]), np.array([0, 0]), LOW[:2], HIGH[:2])
+    seen = np.abs(evaluate(table, point, true_functions=True) - evaluate(table, point))
+    assert seen <= error
+    assert error < 2 * seen + 1e-3
