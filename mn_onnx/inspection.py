@@ -79,6 +79,10 @@ def as_text(description: dict[str, Any]) -> str:
         f"  field        {description['output']!r} over {description['dimension']} coordinates",
         f"  extraction   {fidelity}",
     ]
+    if description["forecast_polygons"] is not None:
+        knots = description["knots_per_period"]
+        fineness = "" if knots is None else f" at {knots:.3g} knots per period"
+        lines.append(f"  expected     about {description['forecast_polygons']:,} polygons{fineness}")
     for stage in ("imported", "canonical"):
         sizes = description[stage]
         layers = " + ".join(str(units) for units in sizes["layers"]) or "none"
