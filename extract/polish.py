@@ -29,6 +29,9 @@ CONVERGED = 1e-12
 REACH = 2.0
 """A vertex moves at most this many times the displacement that the error bounds of its faces allow."""
 
+NEWTON_REACH = 3.0
+"""Nor farther than this many Newton steps: beyond, the mean slope tells nothing of where the level set is."""
+
 RETREATS = 12
 """Vertices of faces that would turn over go half the way back this often, then all the way."""
 
@@ -71,6 +74,7 @@ def polish(
     directions, slopes = _directions(surface)
     reach = REACH * _largest_around(surface, _displacements(surface))
     before = f(surface.vertices)
+    reach = np.minimum(reach, NEWTON_REACH * np.abs(before) / np.where(slopes > 0, slopes, 1.0))
     lengths, after = _roots(f, surface.vertices, directions, before, slopes, reach, lower, upper)
     found = np.abs(after) < np.abs(before)
     moved = np.where(found[:, None], np.clip(surface.vertices + lengths[:, None] * directions, lower, upper),
