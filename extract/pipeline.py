@@ -40,8 +40,8 @@ class Degeneracy:
     ``found``: sentences that say why the exact traversal could not be trusted; empty where it could.
     ``perturbation``: the relative size of the shifts under which the mesh was found, None if none was needed; the
     vertices have been taken back to the network as it is. ``displacement``: the farthest any vertex was taken back.
-    ``merged_vertices``, ``removed_polygons``: what coincided or had no area. ``box_copies``: polygons in a box face
-    that were left out. ``attempts``: perturbations tried.
+    ``merged_vertices``, ``removed_polygons``: what coincided or had no area. ``box_copies``: polygons in a box face,
+    which are left out unless ``only_box_copies``: there are no others. ``attempts``: perturbations tried.
     """
 
     found: tuple[str, ...] = ()
@@ -50,6 +50,7 @@ class Degeneracy:
     merged_vertices: int = 0
     removed_polygons: int = 0
     box_copies: int = 0
+    only_box_copies: bool = False
     attempts: int = 0
 
 
@@ -220,7 +221,9 @@ def _cleaned(surface: Surface, run: _Run, length: float, degeneracy: Degeneracy)
         )
     inner, box_copies = drop_box_copies(surface, run.lower, run.upper, run.coincidence)
     # A solid that fills the box has nothing but copies of its faces, and is better shown than called empty.
-    return inner if inner.n_polygons else surface, replace(degeneracy, box_copies=box_copies)
+    if box_copies and not inner.n_polygons:
+        return surface, replace(degeneracy, box_copies=box_copies, only_box_copies=True)
+    return inner, replace(degeneracy, box_copies=box_copies)
 
 
 def _perturbed(network: Network, run: _Run, size: float, seed: int) -> tuple[Surface, float] | None:

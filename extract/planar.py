@@ -17,6 +17,7 @@ from mn_onnx.extract.edges import half_edge_heads
 from mn_onnx.extract.embed import embed
 from mn_onnx.extract.pipeline import Extraction, extract_surface
 from mn_onnx.extract.schedule import Progress
+from mn_onnx.extract.surface import Surface
 from mn_onnx.ir.network import Network
 
 Floats = NDArray[np.float64]
@@ -56,7 +57,7 @@ def extract_curve(
     _check_dimension(network, 2)
     wide, low, high = embed(network, lower, upper)
     prism = extract_surface(wide, low, high, threads=threads, progress=progress, on_phase=on_phase)
-    surface = prism.surface
+    surface = _inside_the_box(prism)
     rim = np.flatnonzero((surface.twins < 0) & (surface.box_faces == LOWER_Z))
     ends = np.stack([surface.corners[rim], half_edge_heads(surface.offsets, surface.corners)[rim]], axis=1)
     used, numbers = np.unique(ends, return_inverse=True)
@@ -88,12 +89,19 @@ def extract_roots(
     _check_dimension(network, 1)
     wide, low, high = embed(network, lower, upper)
     slab = extract_surface(wide, low, high, threads=threads, progress=progress, on_phase=on_phase)
-    surface = slab.surface
+    surface = _inside_the_box(slab)
     positions = surface.vertices[surface.corners[surface.offsets[:-1]], 0]
     # Where f only touches zero from below it rises to it first, and falls then.
     order = np.lexsort((-surface.gradients[:, 0], positions))
     slopes, errors = surface.gradients[order, 0], surface.errors[order]
     return RootExtraction(Roots(positions[order], slopes, errors, float(low[0]), float(high[0])), slab)
+
+
+def _inside_the_box(extraction: Extraction) -> Surface:
+    """The surface, without polygons if all it has are copies of box faces: the border of the box is no curve of f."""
+    if not extraction.degeneracy.only_box_copies:
+        return extraction.surface
+    return Surface.from_polygons(np.zeros((0, 3)), np.zeros(1, np.int64), np.zeros(0, np.int64))
 
 
 def _check_dimension(network: Network, dimension: int) -> None:
