@@ -81,7 +81,6 @@ class _Task:
     F: Floats
     N: Integers
     root: int
-    volume: float
     chunks: list[_Chunk] = field(default_factory=list)
     following: _Task | None = None
 
@@ -190,7 +189,7 @@ class _Worker:
         N[integers + CELL_SYSTEM_F], N[integers + CELL_SYSTEM_I] = 0, 0
         N[integers + CELL_FLOATS] = floats
         N[integers + CELL_END_F], N[integers + CELL_END_I] = F.size, N.size
-        return _Task(F, N, integers, 0.0)
+        return _Task(F, N, integers)
 
 
 class _Pool:
@@ -255,7 +254,7 @@ def traverse(
     count = threads or os.cpu_count() or 1
     if count < 1:
         raise ValueError(f"threads must be at least 1, not {count}")
-    first = _Task(packed.F, packed.N, packed.root, 1.0)
+    first = _Task(packed.F, packed.N, packed.root)
     pool = _Pool(first, count)
     workers = [_Worker(packed) for _ in range(count)]
 

@@ -107,26 +107,6 @@ def fma(typing_context: Any, a: Any, b: Any, c: Any) -> Any:
 
 
 @intrinsic
-def add(typing_context: Any, a: Any, b: Any) -> Any:
-    """``a + b``."""
-
-    def code(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        return builder.fadd(*arguments)
-
-    return lanes(lanes, lanes), code
-
-
-@intrinsic
-def multiply(typing_context: Any, a: Any, b: Any) -> Any:
-    """``a * b``."""
-
-    def code(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        return builder.fmul(*arguments)
-
-    return lanes(lanes, lanes), code
-
-
-@intrinsic
 def smaller(typing_context: Any, a: Any, b: Any) -> Any:
     """``a`` where ``a < b``, else ``b``."""
 
