@@ -1,8 +1,7 @@
 """Clean-up of a closed mesh some of whose vertices coincide: the mesh that the same polygons have as point sets.
 
-Unlike `mn_onnx.extract.degenerate.collapse_short_edges` nothing is refused. Where the topology of the point set differs
-from that of the mesh, as where a thin tube becomes a point, the polygons around a vertex that do not form one ring or
-fan get a vertex each, so that the result is a manifold again.
+Where the topology of the point set differs from that of the mesh, as where a thin tube becomes a point, the polygons
+around a vertex that do not form one ring or fan get a vertex each, so that the result is a manifold again.
 """
 
 from __future__ import annotations
@@ -25,30 +24,24 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Contraction:
-    """What a contraction did: ``merged_vertices`` that took another's place and ``removed_polygons`` without area.
-
-    ``kept_polygons``: those without area that had to stay, because they border on themselves.
-    """
+    """What a contraction did: ``merged_vertices`` that took another's place and ``removed_polygons`` without area."""
 
     merged_vertices: int
     removed_polygons: int
-    kept_polygons: int
 
 
 def contract_short_edges(surface: Surface, length: float) -> tuple[Surface, Contraction]:
     """Make the ends of every edge of at most ``length`` one vertex and remove the polygons that have no area then.
 
-    A polygon has no area if it is at most ``length`` wide. Polygons on both sides of a removed one are joined. Merged
-    vertices stand where the first of them stood. The order of the remaining polygons does not change, vertices are
-    numbered by their first corner.
+    A polygon has no area if it is at most ``length`` wide; one that borders on itself stays. Polygons on both sides of a
+    removed one are joined. Merged vertices stand where the first of them stood. The order of the remaining polygons
+    does not change, vertices are numbered by their first corner.
     """
-    total = Contraction(0, 0, 0)
+    total = Contraction(0, 0)
     while True:
         surface, step = _contract_once(surface, length)
         total = Contraction(
-            total.merged_vertices + step.merged_vertices,
-            total.removed_polygons + step.removed_polygons,
-            step.kept_polygons,
+            total.merged_vertices + step.merged_vertices, total.removed_polygons + step.removed_polygons
         )
         # A removed polygon may leave an edge between vertices that coincide but had none before.
         if not step.removed_polygons:
@@ -62,11 +55,10 @@ def _contract_once(surface: Surface, length: float) -> tuple[Surface, Contractio
     merged_into = connected_roots(surface.corners[short], heads[short], surface.n_vertices)
     mesh = _contracted(surface, merged_into, heads)
     flat = _flat_polygons(surface, mesh, length)
-    mesh, n_kept = _without(mesh, flat, surface.vertices)
-    mesh = _zipped(mesh)
+    mesh = _zipped(_without(mesh, flat, surface.vertices))
     result = as_surface(surface, mesh)
     n_merged = int(np.count_nonzero(merged_into != np.arange(surface.n_vertices)))
-    return result, Contraction(n_merged, surface.n_polygons - result.n_polygons, n_kept)
+    return result, Contraction(n_merged, surface.n_polygons - result.n_polygons)
 
 
 def _contracted(surface: Surface, merged_into: Indices, heads: Indices) -> LinkedMesh:
@@ -97,12 +89,13 @@ def _flat_polygons(surface: Surface, mesh: LinkedMesh, width: float) -> Indices:
     return starts[measures.areas <= width * measures.perimeters]
 
 
-def _without(mesh: LinkedMesh, flat: Indices, positions: Floats) -> tuple[LinkedMesh, int]:
-    """The mesh without the polygons of the half-edges ``flat``, and how many of them had to stay."""
+def _without(mesh: LinkedMesh, flat: Indices, positions: Floats) -> LinkedMesh:
+    """The mesh without the polygons of the half-edges ``flat``, but for those that border on themselves."""
     if not flat.size:
-        return mesh, 0
+        return mesh
     walks = Walks(mesh.tails, mesh.following, mesh.preceding, mesh.twins, mesh.polygons, mesh.box_faces)
-    n_kept = sum(not walks.flatten(start, positions) for start in flat.tolist())
+    for start in flat.tolist():
+        walks.flatten(start, positions)
     order: list[int] = []
     seen = np.full(mesh.polygons.max() + 1, False)
     for half_edge, polygon in enumerate(mesh.polygons.tolist()):
@@ -121,7 +114,7 @@ def _without(mesh: LinkedMesh, flat: Indices, positions: Floats) -> tuple[Linked
         numbers[np.array(walks.twins, dtype)[order]],
         polygons,
         np.array(walks.box_faces, np.int8)[order],
-    ), n_kept
+    )
 
 
 def _zipped(mesh: LinkedMesh) -> LinkedMesh:

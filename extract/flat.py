@@ -56,14 +56,8 @@ def find_flat_regions(network: Network, lower: Floats, upper: Floats, surface: S
     if not surface.n_polygons:
         return FlatRegions(share)
     polygons = np.linspace(0, surface.n_polygons - 1, min(N_BESIDE, surface.n_polygons)).astype(np.int64)
-    beside = _centres(surface, polygons) + STEP * size * surface.normals[polygons]
+    beside = surface.centres(polygons) + STEP * size * surface.normals[polygons]
     return FlatRegions(share, _flat_share(evaluator, beside, evaluator.values(beside), largest, size))
-
-
-def _centres(surface: Surface, polygons: NDArray[np.int64]) -> Floats:
-    """The mean of the corners of each of ``polygons``, float64 [n, 3]."""
-    corners = zip(surface.offsets[polygons], surface.offsets[polygons + 1], strict=True)
-    return np.array([surface.vertices[surface.corners[begin:end]].mean(axis=0) for begin, end in corners])
 
 
 def _flat_share(evaluator: Evaluator, points: Floats, values: Floats, largest: float, size: float) -> float:

@@ -149,6 +149,14 @@ class Surface:
         """The volume in which ``f`` is negative; None for a surface that is not closed."""
         return None if (self.twins < 0).any() else float(self.measures.volumes.sum())
 
+    def centres(self, polygons: NDArray[np.int64]) -> Floats:
+        """The mean of the corners of each of ``polygons`` (int64 [n]), float64 [n, 3]."""
+        sizes = self.polygon_sizes[polygons]
+        firsts = np.cumsum(sizes) - sizes
+        corners = np.arange(sizes.sum()) + np.repeat(self.offsets[polygons] - firsts, sizes)
+        totals = np.add.reduceat(self.vertices[self.corners[corners]], firsts, axis=0)
+        return np.asarray(totals / sizes[:, None])
+
     def triangles(self) -> Indices:
         """The polygons as fans of triangles: vertex indices [c - 2 p, 3], polygon by polygon."""
         return fan_triangles(self.vertices, self.offsets, self.corners, resolve_threads(None))

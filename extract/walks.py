@@ -48,8 +48,8 @@ class Walks:
             half_edge = self.following[half_edge]
         return found
 
-    def flatten(self, start: int, positions: Floats) -> bool:
-        """Remove the polygon of ``start``, whose corners lie on one line; False if something of it had to stay.
+    def flatten(self, start: int, positions: Floats) -> None:
+        """Remove the polygon of ``start``, whose corners lie on one line, as far as it does not border on itself.
 
         ``positions``: float64 [v, 3], of all vertices.
         """
@@ -67,13 +67,12 @@ class Walks:
                 half_edge, vertex = (arriving, after) if place[before] < place[after] else (leaving, before)
                 twin = self.twins[half_edge]
                 if twin >= 0 and self.polygons[twin] == self.polygons[half_edge]:
-                    return False
+                    return
                 inserted = self._insert(half_edge, vertex)
                 if half_edge == arriving:
                     arriving = inserted
             start = self._cancel(arriving)
             outline = self.outline(start) if start >= 0 else []
-        return True
 
     def _insert(self, half_edge: int, vertex: int) -> int:
         """Divide an edge at ``vertex``, on both sides of it; returns the half-edge from ``vertex`` on."""

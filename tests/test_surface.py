@@ -103,3 +103,14 @@ def test_malformed_polygons_are_refused(change, message):
     arguments = {"vertices": CUBE_VERTICES, "offsets": offsets, "corners": corners, **change}
     with pytest.raises(ValueError, match=message):
         Surface.from_polygons(**arguments)
+
+
+def test_centres_are_the_means_of_corners():
+    surface = joined(cube(2.0, (3.0, -1.0, 0.5)), torus())
+    chosen = np.array([5, 0, surface.n_polygons - 1])
+    expected = [
+        surface.vertices[surface.corners[begin:end]].mean(axis=0)
+        for begin, end in zip(surface.offsets[chosen], surface.offsets[chosen + 1], strict=True)
+    ]
+    np.testing.assert_allclose(surface.centres(chosen), expected, rtol=1e-14)
+    assert surface.centres(np.zeros(0, np.int64)).shape == (0, 3)

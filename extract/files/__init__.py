@@ -12,7 +12,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mn_onnx.extract.blocks import Indices, resolve_threads
-from mn_onnx.extract.degenerate import merge_zero_length_edges
 from mn_onnx.extract.files.ply import read_ply, write_ply
 from mn_onnx.extract.files.polygon_mesh import MeshFileError, PolygonMesh
 from mn_onnx.extract.files.text import read_obj, read_off, write_obj, write_off
@@ -171,11 +170,7 @@ def read_mesh(path: str | os.PathLike[str], *, threads: int | None = None) -> Su
     try:
         if reader is not None:
             return Surface.from_polygons(*reader(source), threads=threads)
-        vertices, triangles = _read_with_trimesh(source)
-        merged = _merged_vertices(vertices, resolve_threads(threads))
-        offsets = np.arange(len(triangles) + 1) * 3
-        surface = Surface.from_polygons(vertices, offsets, merged[triangles].reshape(-1), threads=threads)
-        return merge_zero_length_edges(surface, threads=threads)[0]
+        return _from_loose_triangles(*_read_with_trimesh(source), threads)
     except (ValueError, IndexError) as error:
         raise MeshFileError(f"{source} holds no valid mesh: {error}") from error
 
@@ -193,6 +188,15 @@ def _read_with_trimesh(path: Path) -> tuple[NDArray[np.float64], NDArray[np.int6
     if not len(mesh.faces):
         raise MeshFileError(f"{path} holds no triangles: it is empty or damaged")
     return np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64)
+
+
+def _from_loose_triangles(vertices: NDArray[np.float64], triangles: NDArray[np.int64], threads: int | None) -> Surface:
+    """The surface of triangles that may repeat vertices, without those of fewer than three different corners."""
+    corners = _merged_vertices(vertices, resolve_threads(threads))[triangles]
+    whole = (corners != np.roll(corners, 1, axis=1)).all(axis=1)
+    used, numbers = np.unique(corners[whole], return_inverse=True)
+    offsets = np.arange(np.count_nonzero(whole) + 1) * 3
+    return Surface.from_polygons(vertices[used], offsets, numbers.reshape(-1), threads=threads)
 
 
 def _merged_vertices(vertices: NDArray[np.float64], threads: int) -> Indices:
