@@ -6,15 +6,16 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
+from typing import TypedDict, Unpack
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mn_onnx.extract.box_copies import drop_box_copies
-from mn_onnx.extract.contract import contract_short_edges
-from mn_onnx.extract.flat import FlatRegions, find_flat_regions
-from mn_onnx.extract.limit import SCALES, limit_surface
-from mn_onnx.extract.perturb import perturbation
+from mn_onnx.extract.degeneracy.box_copies import drop_box_copies
+from mn_onnx.extract.degeneracy.contract import contract_short_edges
+from mn_onnx.extract.degeneracy.flat import FlatRegions, find_flat_regions
+from mn_onnx.extract.degeneracy.limit import SCALES, limit_surface
+from mn_onnx.extract.degeneracy.perturb import perturbation
 from mn_onnx.extract.schedule import Progress, TraversalStatistics, traverse
 from mn_onnx.extract.soup import PolygonSoup
 from mn_onnx.extract.surface import Surface
@@ -77,13 +78,12 @@ class _Run:
     upper: Floats
     threads: int | None
     progress: Callable[[Progress], None] | None
-    on_phase: Callable[[str], None] | None
+    on_phase: Callable[[str], None]
     seconds: dict[str, float] = field(default_factory=dict)
 
     @contextmanager
     def phase(self, name: str) -> Iterator[None]:
-        if self.on_phase is not None:
-            self.on_phase(name)
+        self.on_phase(name)
         started = time.perf_counter()
         yield
         self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - started
@@ -93,15 +93,19 @@ class _Run:
         return COINCIDENCE * float(max(np.abs([self.lower, self.upper]).max(), (self.upper - self.lower).max()))
 
 
-def extract_surface(
-    network: Network,
-    lower: Floats,
-    upper: Floats,
-    *,
-    threads: int | None = None,
-    progress: Callable[[Progress], None] | None = None,
-    on_phase: Callable[[str], None] | None = None,
-) -> Extraction:
+class RunOptions(TypedDict, total=False):
+    """How an extraction runs; nothing here changes its result.
+
+    ``threads``: worker threads, all cores by default. ``progress``: called a few times a second during traversals; what
+    it raises stops the extraction. ``on_phase``: called with the name of each phase as it begins.
+    """
+
+    threads: int | None
+    progress: Callable[[Progress], None] | None
+    on_phase: Callable[[str], None]
+
+
+def extract_surface(network: Network, lower: Floats, upper: Floats, **options: Unpack[RunOptions]) -> Extraction:
     """The level set f = 0 of a canonical network in the open box ``lower``..``upper`` (float64 [3] each).
 
     The surface is the boundary of {f < 0}: a polygon that lies in a face of the box is no part of it (unless there are
@@ -109,16 +113,20 @@ def extract_surface(
     Where {f < 0} touches itself in a point or an edge, the mesh has vertices for each of the parts that touch.
 
     A network in general position is traversed once, as it is. Where planes coincide or meet by design, the mesh is that
-    of a perturbed network in the limit of no perturbation (see `mn_onnx.extract.limit`). If no perturbation gives a
-    closed mesh the best one found is returned: ``surface.unmatched`` tells, and the caller must.
+    of a perturbed network in the limit of no perturbation (see `mn_onnx.extract.degeneracy.limit`). If no perturbation
+    gives a closed mesh the best one found is returned: ``surface.unmatched`` tells, and the caller must.
 
-    ``threads``: worker threads, all cores by default; the result is the same for any number. ``progress`` is called a
-    few times a second during traversals, ``on_phase`` with the name of each phase as it begins. Raises ``ValueError``
-    for a network that is not canonical or an empty box.
+    ``options``: see `RunOptions`. Raises ``ValueError`` for a network that is not canonical or an empty box.
     """
-    run = _Run(np.asarray(lower, np.float64), np.asarray(upper, np.float64), threads, progress, on_phase)
+    run = _Run(
+        np.asarray(lower, np.float64),
+        np.asarray(upper, np.float64),
+        options.get("threads"),
+        options.get("progress"),
+        options.get("on_phase", lambda _: None),
+    )
     with run.phase("traverse"):
-        soup, statistics = traverse(network, run.lower, run.upper, threads=threads, progress=progress)
+        soup, statistics = traverse(network, run.lower, run.upper, threads=run.threads, progress=run.progress)
     with run.phase("weld"):
         surface, degeneracy = _as_it_is(soup, statistics.broken_cuts, run)
         del soup

@@ -102,6 +102,7 @@ def _add_extract(commands: argparse._SubParsersAction[argparse.ArgumentParser]) 
         "--attributes",
         nargs="+",
         default=[],
+        choices=("normals", "eps", "displacement"),
         metavar="NAME",
         help="values per face to write (.ply): normals; of smooth networks eps (proved error), displacement",
     )

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
 import sys
 import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,7 @@ from mn_onnx.model import LoadOptions, Model, load
 from mn_onnx.progress import ProgressCallback
 from mn_onnx.reader import read_model
 from mn_onnx.series import count_rows, numbered, row_of
+from mn_onnx.summaries import mesh_summary, planar_summary
 
 
 def run_extract(options: argparse.Namespace) -> int:
@@ -25,7 +27,7 @@ def run_extract(options: argparse.Namespace) -> int:
     Raises `CheckFailed`, after the report is written, if a check fails or the level set is empty; no mesh is then left.
     """
     from mn_onnx.extract.blocks import resolve_threads
-    from mn_onnx.extract.files import MeshFileError, check_mesh_options, write_mesh
+    from mn_onnx.extract.files import check_mesh_options, write_mesh
     from mn_onnx.extraction import extract
     from mn_onnx.profile import profile_text
     from mn_onnx.progress import ProgressEvent, TerminalProgress
@@ -33,7 +35,7 @@ def run_extract(options: argparse.Namespace) -> int:
     if options.all:
         return _extract_rows(options)
     if options.report is not None:
-        _check_parent("--report", Path(options.report))
+        _check_place("--report", options.report)
     with TerminalProgress(enabled=not options.quiet) as progress:
         progress(ProgressEvent("import"))
         model = load(options.model, **_load_options(options))
@@ -41,10 +43,9 @@ def run_extract(options: argparse.Namespace) -> int:
             return _extract_planar(options, model, progress)
         if model.fineness is not None and not options.quiet:
             print(f"mn-onnx: {model.fineness.cost(resolve_threads(options.threads))}", file=sys.stderr)
-        try:
+        with _writing(options.mesh):
             check_mesh_options(options.mesh, float64=options.float64, attributes=options.attributes)
-        except MeshFileError as error:
-            raise UsageError(str(error)) from error
+        _check_attributes(options.attributes, model)
         try:
             surface = extract(
                 model,
@@ -64,7 +65,7 @@ def run_extract(options: argparse.Namespace) -> int:
             raise CheckFailed(report["notes"])
         progress(ProgressEvent("write"))
         started = time.perf_counter()
-        try:
+        with _writing(options.mesh):
             write_mesh(
                 surface,
                 options.mesh,
@@ -72,8 +73,6 @@ def run_extract(options: argparse.Namespace) -> int:
                 triangulate=options.triangulate,
                 attributes=options.attributes,
             )
-        except OSError as error:
-            raise UsageError(f"cannot write {options.mesh}: {error.strerror or error}") from error
         report["seconds"] = {**report["seconds"], "write": time.perf_counter() - started}
     _write_report(options.report, report)
     for problem in report["problems"]:
@@ -81,7 +80,7 @@ def run_extract(options: argparse.Namespace) -> int:
     if options.profile:
         print(profile_text(report), file=sys.stderr)
     if not options.quiet:
-        print(_summary(options.mesh, report))
+        print(mesh_summary(options.mesh, report))
     return 0
 
 
@@ -107,15 +106,16 @@ def _extract_rows(options: argparse.Namespace) -> int:
 
 def _extract_planar(options: argparse.Namespace, model: Model, progress: ProgressCallback) -> int:
     """`run_extract` for a network over one or two coordinates."""
-    from mn_onnx.extract.curve_files import check_curve_path, write_curve
-    from mn_onnx.extract.files import MeshFileError
+    from mn_onnx.extract.planar.files import check_curve_path, write_curve
     from mn_onnx.planar import extract_planar
     from mn_onnx.progress import ProgressEvent
 
-    try:
+    asked = vars(options)
+    useless = [f"--{name}" for name in ("triangulate", "float64", "attributes", "polish", "profile") if asked[name]]
+    if useless:
+        raise UsageError(f"{', '.join(useless)}: only for meshes, and this model is over {model.dimension} coordinates")
+    with _writing(options.mesh):
         check_curve_path(options.mesh, model.dimension)
-    except MeshFileError as error:
-        raise UsageError(str(error)) from error
     found = extract_planar(
         model,
         threads=options.threads,
@@ -127,29 +127,11 @@ def _extract_planar(options: argparse.Namespace, model: Model, progress: Progres
     if not len(found.points):
         raise CheckFailed(found.report["notes"])
     progress(ProgressEvent("write"))
-    try:
+    with _writing(options.mesh):
         write_curve(found.level_set, options.mesh)
-    except OSError as error:
-        raise UsageError(f"cannot write {options.mesh}: {error.strerror or error}") from error
     if not options.quiet:
-        print(_planar_summary(options.mesh, found.report))
+        print(planar_summary(options.mesh, found.report))
     return 0
-
-
-def _planar_summary(path: str, report: dict[str, Any]) -> str:
-    """A few lines about a curve or roots."""
-    if "roots" in report:
-        what = f"{report['roots']:,} roots"
-    else:
-        closure = "closed" if report["closed"] else "open where it leaves the box"
-        what = (
-            f"{report['polylines']:,} polylines of {report['segments']:,} segments, length {report['length']:.6g}, "
-            f"{closure}"
-        )
-    lines = [f"{path}: {what}; max |f| {report['max_abs_f']:.2g}"]
-    if not report["exact"]:
-        lines.append(f"  surrogates within {report['surrogate_eps']:.2g} of the true network")
-    return "\n".join(lines)
 
 
 def run_inspect(options: argparse.Namespace) -> int:
@@ -185,7 +167,7 @@ def run_verify(options: argparse.Namespace) -> int:
     if options.json:
         _print_json(result)
     else:
-        print(_summary(options.mesh, result))
+        print(mesh_summary(options.mesh, result))
     if result["problems"]:
         raise CheckFailed(result["problems"])
     return 0
@@ -202,10 +184,10 @@ def run_bench(options: argparse.Namespace) -> int:
     from mn_onnx.bench.table import print_result
 
     if options.json is not None:
-        _check_parent("--json", Path(options.json))
+        _check_place("--json", options.json)
     if options.plot is not None:
         require(PLOTTING)
-        _check_parent("--plot", Path(options.plot))
+        _check_place("--plot", options.plot)
         check_picture(options.plot)
     settings = BenchOptions(
         grids=GRIDS if options.grids is None else options.grids,
@@ -248,79 +230,41 @@ def _load_options(options: argparse.Namespace) -> LoadOptions:
     }
 
 
-def _check_parent(option: str, path: Path) -> None:
-    if path.is_dir():
-        raise UsageError(f"{option} {path}: this is a folder")
-    if not path.absolute().parent.is_dir():
-        raise UsageError(f"{option} {path}: the folder {path.absolute().parent} does not exist")
+@contextmanager
+def _writing(path: str) -> Iterator[None]:
+    """Turns what can go wrong with the file ``path`` into a `UsageError`."""
+    from mn_onnx.extract.files import MeshFileError
+
+    try:
+        yield
+    except MeshFileError as error:
+        raise UsageError(str(error)) from error
+    except OSError as error:
+        raise UsageError(f"cannot write {path}: {error.strerror or error}") from error
+
+
+def _check_attributes(names: Sequence[str], model: Model) -> None:
+    """Raise `UsageError` if a mesh of ``model`` will not have one of the values per face."""
+    if model.exact and not {"eps", "displacement"}.isdisjoint(names):
+        raise UsageError("--attributes: only networks with smooth activations have eps and displacement, not this one")
+
+
+def _check_place(option: str, path: str) -> None:
+    from mn_onnx.extract.files.whole import place_problems
+
+    for problem in place_problems(Path(path)):
+        raise UsageError(f"{option} {path}: {problem}")
 
 
 def _write_report(target: str | None, report: Any) -> None:
     """Write ``report`` as JSON, whole or not at all; nothing if ``target`` is None."""
     if target is None:
         return
-    path = Path(target)
-    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
-    try:
-        partial.write_text(json.dumps(report, indent=2, allow_nan=False) + "\n")
-        partial.replace(path)
-    except OSError as error:
-        raise UsageError(f"cannot write the report {target}: {error.strerror or error}") from error
-    finally:
-        partial.unlink(missing_ok=True)
+    from mn_onnx.extract.files.whole import written_whole
+
+    with _writing(target), written_whole(Path(target)) as stream:
+        stream.write((json.dumps(report, indent=2, allow_nan=False) + "\n").encode())
 
 
 def _print_json(value: Any) -> None:
     print(json.dumps(value, indent=2, allow_nan=False))
-
-
-def _polish_line(polish: dict[str, Any]) -> str:
-    held = f"; {polish['held_vertices']:,} vertices held back so that no face turns over" * bool(
-        polish["held_vertices"]
-    )
-    stray = f"; {polish['stray_vertices']:,} found no root in reach" * bool(polish["stray_vertices"])
-    return (
-        f"  polished: mean |f_true| at vertices {polish['mean_abs_f_before']:.2g} before, {polish['mean_abs_f']:.2g} "
-        f"after (max {polish['max_abs_f']:.2g}), on faces {polish['true_mean_abs_f']:.2g}; moved by up to "
-        f"{polish['largest_move']:.2g}{held}{stray}"
-    )
-
-
-def _summary(mesh: str, report: dict[str, Any]) -> str:
-    """A few lines about a mesh."""
-    if report["unmatched_edges"]:
-        closure = f"{report['unmatched_edges']:,} edges without neighbour"
-    elif report["boundary_edges"]:
-        closure = "closed but for where it leaves the box"
-    else:
-        closure = "closed"
-    lines = [
-        f"{mesh}: {report['polygons']:,} polygons, {report['vertices']:,} vertices, {report['components']} components, "
-        f"Euler number {report['euler']}, {closure}"
-    ]
-    if report["max_abs_f"] is not None:
-        lines.append(f"  |f| on the mesh: max {report['max_abs_f']:.2g}, mean {report['mean_abs_f']:.2g}")
-    if not report["exact"]:
-        lines.append(
-            f"  surrogates within {report['surrogate_eps']:.2g} of the true network, whose |f - level| on the mesh is "
-            f"{report['true_mean_abs_f']:.2g} in the mean"
-            if report["true_mean_abs_f"] is not None
-            else f"  surrogates within {report['surrogate_eps']:.2g} of the true network"
-        )
-    if report.get("surface_eps") is not None:
-        lines.append(
-            f"  on the mesh |f_true - f| is certified at most {report['surface_eps']:.2g} (median "
-            f"{report['surface_eps_median']:.2g}); to first order the true surface is within "
-            f"{report['displacement']:.2g} (median {report['displacement_median']:.2g})"
-        )
-    if report.get("polish") is not None:
-        lines.append(_polish_line(report["polish"]))
-    if report["parity_runtime"] is not None:
-        lines.append(
-            f"  {report['parity_runtime']}: differs by {report['parity_max_abs_err']:.2g} "
-            f"({report['parity_allowed_err']:.2g} allowed), mean |f - level| {report['ort_mean_abs_f']:.2g}"
-        )
-    if "seconds" in report:
-        lines.append("  " + ", ".join(f"{phase} {seconds:.2f} s" for phase, seconds in report["seconds"].items()))
-    lines += [f"  note: {note}" for note in report["notes"]]
-    return "\n".join(lines)

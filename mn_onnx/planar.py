@@ -9,19 +9,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mn_onnx.errors import CheckFailed, UsageError
-from mn_onnx.extract.curve import Curve, Roots
 from mn_onnx.extract.pipeline import Extraction
-from mn_onnx.extract.planar import extract_curve, extract_roots
-from mn_onnx.extraction import Phases, empty_level_set, traversal_listener
+from mn_onnx.extract.planar.curve import Curve, Roots
+from mn_onnx.extract.planar.prism import extract_curve, extract_roots
+from mn_onnx.findings import empty_level_set
 from mn_onnx.ir.evaluate import evaluate, float64_error_bound
-from mn_onnx.memory import MemoryLimit
-from mn_onnx.model import LoadOptions, Model, load
-from mn_onnx.parity import check_parity
-from mn_onnx.progress import ProgressCallback, ProgressEvent
+from mn_onnx.model import LoadOptions, Model
+from mn_onnx.progress import ProgressCallback
 from mn_onnx.reader import ModelSource
 from mn_onnx.report import model_entries, parity_entries
+from mn_onnx.run import Phases, Run, loaded, prepare
 from mn_onnx.runtime import Runtime
-from mn_onnx.warmup import warm_up
 
 Floats = NDArray[np.float64]
 
@@ -64,36 +62,11 @@ def extract_planar(
     Raises `UsageError` for a network over another number of coordinates, and as `mn_onnx.extract` does.
     """
     phases = Phases(progress)
-    model = source if isinstance(source, Model) else load(source, **options)
+    model = loaded(source, options, phases)
     if model.dimension not in (1, 2):
         raise UsageError(f"the field is over {model.dimension} coordinates: use extract, which makes a mesh")
-    limit = MemoryLimit.of(max_memory)
-    phases.seconds.update(model.seconds)
-    runtime = parity = None
-    if check:
-        with phases.phase("check"):
-            runtime = Runtime(model.read, model.imported.layout)
-            parity = check_parity(model, runtime)
-            if parity.problems():
-                raise CheckFailed(parity.problems())
-    with phases.phase("compile"):
-        warm_up(3)
-    listen = traversal_listener(phases, limit)
-
-    def announce(name: str) -> None:
-        phases.announce(ProgressEvent(name))
-
-    level_set: Curve | Roots
-    if model.dimension == 2:
-        curve = extract_curve(
-            model.network, model.lower, model.upper, threads=threads, progress=listen, on_phase=announce
-        )
-        level_set, extraction = curve.curve, curve.prism
-    else:
-        roots = extract_roots(
-            model.network, model.lower, model.upper, threads=threads, progress=listen, on_phase=announce
-        )
-        level_set, extraction = roots.roots, roots.slab
+    run = prepare(model, phases, threads=threads, check=check, max_memory=max_memory)
+    level_set, extraction = _extracted(model, run)
     phases.seconds.update(extraction.seconds)
     found = PlanarLevelSet(level_set, {})
     problems, notes = level_set.problems(), []
@@ -102,13 +75,13 @@ def extract_planar(
         notes.append(empty_level_set(model))
     else:
         with phases.phase("check"):
-            residuals, failed = _residuals(model, found.points, runtime)
+            residuals, failed = _residuals(model, found.points, run.runtime)
             problems += failed
     report = {
         **model_entries(model),
         **_measures(level_set),
         **residuals,
-        **parity_entries(parity),
+        **parity_entries(run.parity),
         **_traversal_entries(extraction),
         "seconds": dict(phases.seconds),
         "problems": problems,
@@ -118,6 +91,15 @@ def extract_planar(
     if check and problems:
         raise CheckFailed(problems)
     return found
+
+
+def _extracted(model: Model, run: Run) -> tuple[Curve | Roots, Extraction]:
+    """The level set, and the extraction in three dimensions that it was found by."""
+    if model.dimension == 2:
+        curve = extract_curve(model.network, model.lower, model.upper, **run.traversal())
+        return curve.curve, curve.prism
+    roots = extract_roots(model.network, model.lower, model.upper, **run.traversal())
+    return roots.roots, roots.slab
 
 
 def _measures(level_set: Curve | Roots) -> dict[str, Any]:

@@ -27,7 +27,7 @@ COMMAND = [sys.executable, "-m", "mn_onnx"]
 @pytest.fixture(scope="module", autouse=True)
 def compiled_kernels() -> None:
     """What is compiled here is found in the cache by the processes that the tests start."""
-    warm_up(3)
+    warm_up()
 
 
 @pytest.fixture
@@ -259,3 +259,17 @@ def test_help_comes_at_once() -> None:
         assert "extract" in run("--help").stdout
         quickest = min(quickest, time.monotonic() - started)
     assert quickest < 0.3
+
+
+@pytest.mark.parametrize("name", ["eps", "displacement", "colour"])
+def test_values_that_faces_will_not_have_are_refused_before_the_work(
+    name: str, model: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    arguments = ["extract", str(model), "-o", str(tmp_path / "mesh.ply"), "--attributes", "normals", name]
+    if name == "colour":  # argparse's own message
+        with pytest.raises(SystemExit, match="2"):
+            main(arguments)
+    else:
+        assert main(arguments) == EXIT_USAGE
+    assert "--attributes" in capsys.readouterr().err
+    assert not (tmp_path / "mesh.ply").exists()

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from known_meshes import cube, flatten, joined, sheet, soup_of, torus
 
-from mn_onnx.extract.box_copies import drop_box_copies
-from mn_onnx.extract.contract import contract_short_edges
+from mn_onnx.extract.degeneracy.box_copies import drop_box_copies
+from mn_onnx.extract.degeneracy.contract import contract_short_edges
+from mn_onnx.extract.degeneracy.limit import limit_surface
 from mn_onnx.extract.invariants import check_invariants, mark_box_edges
-from mn_onnx.extract.limit import limit_surface
 from mn_onnx.extract.surface import Surface
 from mn_onnx.extract.weld import weld
 

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from mn_onnx.extract.perturb import perturbation
+from mn_onnx.extract.degeneracy.perturb import perturbation
 from mn_onnx.ir.evaluate import evaluate
 from mn_onnx.ir.network import AffineRow, Network, Unit
 from oracle.random_networks import RandomNetwork

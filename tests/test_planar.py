@@ -10,11 +10,11 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 
-from mn_onnx.extract.curve import Curve
-from mn_onnx.extract.curve_files import write_curve
-from mn_onnx.extract.embed import embed
 from mn_onnx.extract.files.polygon_mesh import MeshFileError
-from mn_onnx.extract.planar import extract_curve, extract_roots
+from mn_onnx.extract.planar.curve import Curve
+from mn_onnx.extract.planar.embed import embed
+from mn_onnx.extract.planar.files import write_curve
+from mn_onnx.extract.planar.prism import extract_curve, extract_roots
 from mn_onnx.ir.evaluate import evaluate
 from mn_onnx.ir.network import Network
 from oracle.integer_networks import IntegerNetwork

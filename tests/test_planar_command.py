@@ -12,7 +12,7 @@ import pytest
 
 import mn_onnx
 from mn_onnx.cli import EXIT_CHECK, EXIT_USAGE, main
-from mn_onnx.extract.curve import Curve, Roots
+from mn_onnx.extract.planar.curve import Curve, Roots
 from oracle.sketch import Sketch, as_onnx
 
 
@@ -95,3 +95,17 @@ def test_command_reports_an_empty_level_set(tmp_path: Path, capsys: pytest.Captu
     assert main(["extract", model, "-o", str(tmp_path / "curve.svg")]) == EXIT_CHECK
     assert "the level set is empty" in capsys.readouterr().err
     assert not (tmp_path / "curve.svg").exists()
+
+
+def test_options_of_meshes_are_refused_for_curves(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    target = tmp_path / "curve.svg"
+    arguments = ["extract", saved(ball(0.5, 2), tmp_path), "-o", str(target), "--float64", "--polish"]
+    assert main(arguments) == EXIT_USAGE
+    assert "--float64, --polish: only for meshes" in capsys.readouterr().err
+    assert not target.exists()
+
+
+def test_a_loaded_model_takes_no_further_options() -> None:
+    model = mn_onnx.load(ball(0.5, 2))
+    with pytest.raises(mn_onnx.UsageError, match="loaded already: give level to load"):
+        mn_onnx.extract_planar(model, level=0.1)

@@ -16,6 +16,7 @@ from mn_onnx.extract.files.ply import read_ply, write_ply
 from mn_onnx.extract.files.polygon_mesh import MeshFileError, PolygonMesh
 from mn_onnx.extract.files.text import read_obj, read_off, write_obj, write_off
 from mn_onnx.extract.files.triangles import read_3mf, write_3mf, write_glb, write_stl
+from mn_onnx.extract.files.whole import place_problems, written_whole
 from mn_onnx.extract.surface import Surface
 from mn_onnx.extract.weld import first_of_equal_keys
 
@@ -76,10 +77,7 @@ def check_mesh_options(path: str | os.PathLike[str], *, float64: bool = False, a
             )
         if list(attributes) and not form.attributes:
             problems.append(f"{target.suffix} holds no values per face; write to {_holding('attributes')}")
-    if not target.parent.is_dir():
-        problems.append(f"the folder {target.parent} does not exist")
-    elif target.is_dir():
-        problems.append(f"{target} is a folder")
+    problems += place_problems(target)
     if problems:
         raise MeshFileError("; ".join(problems))
 
@@ -112,14 +110,8 @@ def write_mesh(
     check_mesh_options(target, float64=float64, attributes=names)
     form = _FORMATS[target.suffix.lower()]
     mesh = _polygon_mesh(surface, triangulate or not form.polygons, _columns(surface, names))
-    partial = target.with_name(f".{target.name}.{os.getpid()}.partial")
-    try:
-        with partial.open("wb") as stream:
-            form.write(stream, mesh, float64=float64)
-        partial.replace(target)
-    except BaseException:
-        partial.unlink(missing_ok=True)
-        raise
+    with written_whole(target) as stream:
+        form.write(stream, mesh, float64=float64)
 
 
 def _columns(surface: Surface, names: list[str]) -> dict[str, NDArray[Any]]:

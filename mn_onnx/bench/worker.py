@@ -64,7 +64,7 @@ def _measure_exact(job: Job) -> Measurement:
     model = load(job.path, **job.load)
     limit = MemoryLimit.of(job.max_memory)
     started = time.perf_counter()
-    warm_up(model.dimension).triangles()
+    warm_up().triangles()
     warm = time.perf_counter() - started
     idle = resident_memory()
 

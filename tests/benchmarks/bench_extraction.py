@@ -30,7 +30,7 @@ ROUNDS = 3
 
 @pytest.fixture(scope="module", params=NAMES)
 def model(request: pytest.FixtureRequest) -> mn_onnx.Model:
-    warm_up(3).triangles()
+    warm_up().triangles()
     return mn_onnx.load(MODELS / f"{request.param}.onnx")
 
 

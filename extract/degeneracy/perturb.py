@@ -4,7 +4,7 @@ Every unit's bias moves by a pseudo-random amount of either sign, relative to th
 that planes which coincide or meet in one point by design no longer do. The output's bias rises by more than all units
 together can lower the output: where f is zero on a whole region, the perturbed f is positive there, as zero counts as
 positive everywhere. The idea is that of symbolic perturbation (Edelsbrunner and Muecke, "Simulation of simplicity",
-1990), carried out in numbers; `mn_onnx.extract.limit` takes the result back to the network as it is.
+1990), carried out in numbers; `mn_onnx.extract.degeneracy.limit` takes the result back to the network as it is.
 """
 
 from __future__ import annotations

@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 
 from mn_onnx.extract.blocks import Indices, index_dtype, resolve_threads
 from mn_onnx.extract.components import connected_roots
+from mn_onnx.extract.degeneracy.linked_mesh import LinkedMesh, as_surface, link_in_polygons
+from mn_onnx.extract.degeneracy.walks import Walks
 from mn_onnx.extract.edges import half_edge_heads
-from mn_onnx.extract.linked_mesh import LinkedMesh, as_surface, link_in_polygons
 from mn_onnx.extract.measures import measure_polygons
 from mn_onnx.extract.surface import Surface
-from mn_onnx.extract.walks import Walks
 
 Floats = NDArray[np.float64]
 
@@ -33,8 +33,8 @@ class Contraction:
 def contract_short_edges(surface: Surface, length: float) -> tuple[Surface, Contraction]:
     """Make the ends of every edge of at most ``length`` one vertex and remove the polygons that have no area then.
 
-    A polygon has no area if it is at most ``length`` wide; one that borders on itself stays. Polygons on both sides of a
-    removed one are joined. Merged vertices stand where the first of them stood. The order of the remaining polygons
+    A polygon has no area if it is at most ``length`` wide; one that borders on itself stays. Polygons on both sides of
+    a removed one are joined. Merged vertices stand where the first of them stood. The order of the remaining polygons
     does not change, vertices are numbered by their first corner.
     """
     total = Contraction(0, 0)

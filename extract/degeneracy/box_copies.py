@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mn_onnx.extract.blocks import index_dtype
-from mn_onnx.extract.linked_mesh import LinkedMesh, as_surface, link_in_polygons
+from mn_onnx.extract.degeneracy.linked_mesh import LinkedMesh, as_surface, link_in_polygons
 from mn_onnx.extract.surface import Surface
 
 Floats = NDArray[np.float64]

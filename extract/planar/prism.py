@@ -6,17 +6,16 @@ a polygon per segment, or a square per root; what is sought is its rim on the lo
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Unpack
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mn_onnx.extract.curve import Curve, Roots
 from mn_onnx.extract.edges import half_edge_heads
-from mn_onnx.extract.embed import embed
-from mn_onnx.extract.pipeline import Extraction, extract_surface
-from mn_onnx.extract.schedule import Progress
+from mn_onnx.extract.pipeline import Extraction, RunOptions, extract_surface
+from mn_onnx.extract.planar.curve import Curve, Roots
+from mn_onnx.extract.planar.embed import embed
 from mn_onnx.extract.surface import Surface
 from mn_onnx.ir.network import Network
 
@@ -41,22 +40,14 @@ class RootExtraction:
     slab: Extraction
 
 
-def extract_curve(
-    network: Network,
-    lower: Floats,
-    upper: Floats,
-    *,
-    threads: int | None = None,
-    progress: Callable[[Progress], None] | None = None,
-    on_phase: Callable[[str], None] | None = None,
-) -> CurveExtraction:
+def extract_curve(network: Network, lower: Floats, upper: Floats, **options: Unpack[RunOptions]) -> CurveExtraction:
     """The level set f = 0 of a canonical network over two coordinates, in the box ``lower``..``upper`` (float64 [2]).
 
     Arguments, convention and errors as in `extract_surface`; ``curve.problems()`` tells if it does not close.
     """
     _check_dimension(network, 2)
     wide, low, high = embed(network, lower, upper)
-    prism = extract_surface(wide, low, high, threads=threads, progress=progress, on_phase=on_phase)
+    prism = extract_surface(wide, low, high, **options)
     surface = _inside_the_box(prism)
     rim = np.flatnonzero((surface.twins < 0) & (surface.box_faces == LOWER_Z))
     ends = np.stack([surface.corners[rim], half_edge_heads(surface.offsets, surface.corners)[rim]], axis=1)
@@ -73,22 +64,14 @@ def extract_curve(
     return CurveExtraction(curve, prism)
 
 
-def extract_roots(
-    network: Network,
-    lower: Floats,
-    upper: Floats,
-    *,
-    threads: int | None = None,
-    progress: Callable[[Progress], None] | None = None,
-    on_phase: Callable[[str], None] | None = None,
-) -> RootExtraction:
+def extract_roots(network: Network, lower: Floats, upper: Floats, **options: Unpack[RunOptions]) -> RootExtraction:
     """The level set f = 0 of a canonical network over one coordinate between ``lower`` and ``upper`` (float64 [1]).
 
     Arguments, convention and errors as in `extract_surface`.
     """
     _check_dimension(network, 1)
     wide, low, high = embed(network, lower, upper)
-    slab = extract_surface(wide, low, high, threads=threads, progress=progress, on_phase=on_phase)
+    slab = extract_surface(wide, low, high, **options)
     surface = _inside_the_box(slab)
     positions = surface.vertices[surface.corners[surface.offsets[:-1]], 0]
     # Where f only touches zero from below it rises to it first, and falls then.

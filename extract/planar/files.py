@@ -5,14 +5,16 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Callable, Mapping
+from dataclasses import fields
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mn_onnx.extract.curve import Curve, Roots
 from mn_onnx.extract.files.polygon_mesh import MeshFileError
+from mn_onnx.extract.files.whole import place_problems, written_whole
+from mn_onnx.extract.planar.curve import Curve, Roots
 
 STROKE = 1 / 400
 """Width of the lines in a drawing, relative to the longer side of the box."""
@@ -28,19 +30,12 @@ def write_curve(curve: Curve | Roots, path: str | os.PathLike[str]) -> None:
     Raises MeshFileError for an unknown extension or a folder that does not exist; OSError if writing fails.
     """
     target = Path(path)
-    dimension = 1 if isinstance(curve, Roots) else 2
-    check_curve_path(target, dimension)
-    partial = target.with_name(f".{target.name}.{os.getpid()}.partial")
-    try:
-        with partial.open("wb") as stream:
-            if isinstance(curve, Roots):
-                _ROOT_WRITERS[target.suffix.lower()](stream, curve)
-            else:
-                _WRITERS[target.suffix.lower()](stream, curve)
-        partial.replace(target)
-    except BaseException:
-        partial.unlink(missing_ok=True)
-        raise
+    check_curve_path(target, 1 if isinstance(curve, Roots) else 2)
+    with written_whole(target) as stream:
+        if isinstance(curve, Roots):
+            _ROOT_WRITERS[target.suffix.lower()](stream, curve)
+        else:
+            _CURVE_WRITERS[target.suffix.lower()](stream, curve)
 
 
 def check_curve_path(path: str | os.PathLike[str], dimension: int = 2) -> None:
@@ -50,14 +45,11 @@ def check_curve_path(path: str | os.PathLike[str], dimension: int = 2) -> None:
     """
     target = Path(path)
     problems = []
-    kind, writers = ("a curve", list(_WRITERS)) if dimension == 2 else ("roots", list(_ROOT_WRITERS))
+    kind, writers = ("a curve", list(_CURVE_WRITERS)) if dimension == 2 else ("roots", list(_ROOT_WRITERS))
     if target.suffix.lower() not in writers:
         found = f"ends in {target.suffix}" if target.suffix else "has no extension"
         problems.append(f"{target} {found}; the level set of this model is {kind}, written to {', '.join(writers)}")
-    if not target.parent.is_dir():
-        problems.append(f"the folder {target.parent} does not exist")
-    elif target.is_dir():
-        problems.append(f"{target} is a folder")
+    problems += place_problems(target)
     if problems:
         raise MeshFileError("; ".join(problems))
 
@@ -89,43 +81,21 @@ def _write_json(stream: BinaryIO, curve: Curve) -> None:
     stream.write(json.dumps({**box, "polylines": polylines}).encode())
 
 
-def _write_npz(stream: BinaryIO, curve: Curve) -> None:
-    np.savez_compressed(
-        stream,
-        vertices=curve.vertices,
-        segments=curve.segments,
-        offsets=curve.offsets,
-        closed=curve.closed,
-        gradients=curve.gradients,
-        errors=curve.errors,
-        lower=curve.lower,
-        upper=curve.upper,
-    )
-
-
 def _write_roots_json(stream: BinaryIO, roots: Roots) -> None:
-    entries = {
-        "lower": roots.lower,
-        "upper": roots.upper,
-        "positions": roots.positions.tolist(),
-        "slopes": roots.slopes.tolist(),
-        "errors": roots.errors.tolist(),
-    }
-    stream.write(json.dumps(entries).encode())
+    stream.write(json.dumps({name: values.tolist() for name, values in _arrays(roots).items()}).encode())
 
 
-def _write_roots_npz(stream: BinaryIO, roots: Roots) -> None:
-    np.savez_compressed(
-        stream,
-        positions=roots.positions,
-        slopes=roots.slopes,
-        errors=roots.errors,
-        lower=np.array(roots.lower),
-        upper=np.array(roots.upper),
-    )
+def _write_npz(stream: BinaryIO, level_set: Curve | Roots) -> None:
+    arrays: dict[str, Any] = _arrays(level_set)  # numpy's stubs take any keyword for `allow_pickle`
+    np.savez_compressed(stream, **arrays)
 
 
-_WRITERS: Mapping[str, Callable[[BinaryIO, Curve], None]] = {
+def _arrays(level_set: Curve | Roots) -> dict[str, NDArray[Any]]:
+    """All fields, by name."""
+    return {field.name: np.asarray(getattr(level_set, field.name)) for field in fields(level_set)}
+
+
+_CURVE_WRITERS: Mapping[str, Callable[[BinaryIO, Curve], None]] = {
     ".svg": _write_svg,
     ".json": _write_json,
     ".npz": _write_npz,
@@ -133,5 +103,5 @@ _WRITERS: Mapping[str, Callable[[BinaryIO, Curve], None]] = {
 
 _ROOT_WRITERS: Mapping[str, Callable[[BinaryIO, Roots], None]] = {
     ".json": _write_roots_json,
-    ".npz": _write_roots_npz,
+    ".npz": _write_npz,
 }

@@ -1,0 +1,1 @@
+"""Level sets of networks over two coordinates (curves) and over one (roots), and their files."""
