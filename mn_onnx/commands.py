@@ -179,8 +179,8 @@ def run_bench(options: argparse.Namespace) -> int:
 
     from mn_onnx.bench import BenchOptions, run_bench
     from mn_onnx.bench.extras import PLOTTING, require
+    from mn_onnx.bench.options import GRIDS
     from mn_onnx.bench.plot import check_picture, plot
-    from mn_onnx.bench.run import GRIDS
     from mn_onnx.bench.table import print_result
 
     if options.json is not None:
@@ -202,7 +202,8 @@ def run_bench(options: argparse.Namespace) -> int:
         result = run_bench(options.models, settings, on_start=status.update)
     _write_report(options.json, result.as_dict())
     if options.plot is not None:
-        plot(result, options.plot)
+        with _writing(options.plot):
+            plot(result, options.plot)
     if not options.quiet:
         print_result(result, Console())
     failures = [f"{model.model}: {failure}" for model in result.models for failure in model.failures]

@@ -17,6 +17,7 @@ from small_models import TILT, octahedron_model, refused_model
 
 import mn_onnx
 from mn_onnx.bench import cubes, extras
+from mn_onnx.bench.options import BenchOptions
 from mn_onnx.bench.quality import soft_precision, soft_recall
 from mn_onnx.bench.result import BenchResult, Measurement, ModelResult
 from mn_onnx.bench.run import in_fresh_process
@@ -236,7 +237,8 @@ class Deadly:
 
 
 def test_a_process_that_dies_is_a_failure() -> None:
-    job = Job("gone.onnx", {"level": Deadly()}, 8, 1, 1, 100, None, None)  # type: ignore[typeddict-item]
+    options = BenchOptions(repeat=1, samples=100, load={"level": Deadly()})  # type: ignore[typeddict-item]
+    job = Job("gone.onnx", 8, 1, options)
     outcome = in_fresh_process(job)
     assert isinstance(outcome, Failure)
     assert (

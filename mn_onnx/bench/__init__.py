@@ -4,7 +4,8 @@
 Needs the extra ``bench``.
 """
 
+from mn_onnx.bench.options import BenchOptions
 from mn_onnx.bench.result import BenchResult, Measurement, ModelResult
-from mn_onnx.bench.run import BenchOptions, run_bench
+from mn_onnx.bench.run import run_bench
 
 __all__ = ["BenchOptions", "BenchResult", "Measurement", "ModelResult", "run_bench"]

@@ -8,6 +8,7 @@ from pathlib import Path
 
 from mn_onnx.bench.result import BenchResult
 from mn_onnx.errors import UsageError
+from mn_onnx.extract.files.whole import written_whole
 
 SMALLEST_ERROR = 1e-18
 """Errors of zero are drawn here, for want of a place on a logarithmic axis."""
@@ -50,4 +51,6 @@ def plot(result: BenchResult, path: str | os.PathLike[str]) -> None:
     axes.grid(visible=True, which="major", alpha=0.3)
     if result.models:
         axes.legend(fontsize=8)
-    figure.savefig(path, dpi=120)
+    target = Path(path)
+    with written_whole(target) as stream:
+        figure.savefig(stream, dpi=120, format=target.suffix.lower().removeprefix("."))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import platform
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import replace
 from importlib.metadata import version
 from multiprocessing import get_context
 from multiprocessing.connection import Connection
@@ -15,6 +15,7 @@ from typing import Any
 import psutil
 
 from mn_onnx.bench.extras import RECALL, SAMPLING, require
+from mn_onnx.bench.options import BenchOptions
 from mn_onnx.bench.quality import reference_points
 from mn_onnx.bench.result import BenchResult, Measurement, ModelResult
 from mn_onnx.bench.worker import Failure, Job, measure
@@ -23,29 +24,6 @@ from mn_onnx.extract.blocks import resolve_threads
 from mn_onnx.extract.files import MeshFileError
 from mn_onnx.model import LoadOptions, load
 from mn_onnx.report import versions
-
-GRIDS = (64, 128, 256)
-SAMPLES = 1 << 20
-REPEAT = 3
-
-
-@dataclass(frozen=True)
-class BenchOptions:
-    """How to measure.
-
-    ``grids``: points per axis of marching cubes. ``threads``: for both methods, all cores by default. ``repeat``: runs
-    of which the median counts. ``samples``: points of a mesh at which soft precision is measured. ``reference``: mesh
-    file of the true shape, for soft recall. ``max_memory``: bytes that exact extraction may take, by default most of
-    what is available. ``load``: options of `mn_onnx.load` for all models.
-    """
-
-    grids: Sequence[int] = GRIDS
-    threads: int | None = None
-    repeat: int = REPEAT
-    samples: int = SAMPLES
-    reference: str | None = None
-    max_memory: int | None = None
-    load: LoadOptions = field(default_factory=LoadOptions)
 
 
 def run_bench(
@@ -61,25 +39,20 @@ def run_bench(
     unusable, or if packages of the extra ``bench`` are missing.
     """
     options = options or BenchOptions()
-    _validate(options)
+    options.check()
+    require(SAMPLING | RECALL if options.reference else SAMPLING)
+    if options.reference:
+        _check_reference(options.reference)
     machine = _machine()
     paths = [Path(model) for model in models]
     hashes = _check_models(paths, options.load)
     threads = resolve_threads(options.threads)
+    options = replace(options, threads=threads)
     results = []
     for path, sha256 in zip(paths, hashes, strict=True):
         outcomes = []
         for resolution in (None, *sorted(set(options.grids))):
-            job = Job(
-                path=str(path),
-                load=options.load,
-                resolution=resolution,
-                threads=threads,
-                repeat=options.repeat,
-                samples=options.samples,
-                reference=options.reference,
-                max_memory=options.max_memory,
-            )
+            job = Job(str(path), resolution, threads, options)
             if on_start is not None:
                 on_start(f"{path.name}: {job.title}")
             outcomes.append(in_fresh_process(job))
@@ -89,20 +62,11 @@ def run_bench(
     return BenchResult(machine, threads, options.repeat, options.samples, options.reference, results)
 
 
-def _validate(options: BenchOptions) -> None:
-    counts = [("repeat", options.repeat, 1), ("samples", options.samples, 1)]
-    counts += [("a grid", grid, 2) for grid in options.grids]
-    if options.threads is not None:
-        counts.append(("threads", options.threads, 1))
-    problems = [f"{name} must be at least {least}, not {value}" for name, value, least in counts if value < least]
-    if problems:
-        raise UsageError("; ".join(problems))
-    require(SAMPLING | RECALL if options.reference else SAMPLING)
-    if options.reference:
-        try:
-            reference_points(options.reference)
-        except (MeshFileError, OSError, ValueError) as error:
-            raise UsageError(f"--reference {options.reference}: {error}") from error
+def _check_reference(path: str) -> None:
+    try:
+        reference_points(path)
+    except (MeshFileError, OSError, ValueError) as error:
+        raise UsageError(f"--reference {path}: {error}") from error
 
 
 def _check_models(paths: Sequence[Path], options: LoadOptions) -> list[str]:

@@ -5,12 +5,13 @@ from __future__ import annotations
 import statistics
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import TypeVar
+from dataclasses import dataclass, replace
+from typing import Generic, TypeVar
 
 import numpy as np
 
 from mn_onnx.bench.cubes import Cubes, marching_cubes
+from mn_onnx.bench.options import BenchOptions
 from mn_onnx.bench.quality import reference_points, soft_precision, soft_recall
 from mn_onnx.bench.result import CUBES, EXACT, Measurement
 from mn_onnx.bench.sampler import fastest, open_runtime
@@ -19,7 +20,7 @@ from mn_onnx.extract.invariants import check_invariants
 from mn_onnx.extract.pipeline import Extraction, extract_surface
 from mn_onnx.extract.surface import Surface
 from mn_onnx.memory import MemoryLimit, peak_memory, resident_memory
-from mn_onnx.model import LoadOptions, Model, load
+from mn_onnx.model import Model, load
 from mn_onnx.warmup import warm_up
 
 Seconds = dict[str, float]
@@ -28,16 +29,12 @@ Result = TypeVar("Result")
 
 @dataclass(frozen=True)
 class Job:
-    """One measurement to make; ``resolution`` is None for exact extraction. The rest as in `BenchOptions`."""
+    """One measurement to make, of the model in the file ``path``; ``resolution`` is None for exact extraction."""
 
     path: str
-    load: LoadOptions
     resolution: int | None
     threads: int
-    repeat: int
-    samples: int
-    reference: str | None
-    max_memory: int | None
+    options: BenchOptions
 
     @property
     def title(self) -> str:
@@ -61,12 +58,11 @@ def measure(job: Job) -> Measurement | Failure:
 
 
 def _measure_exact(job: Job) -> Measurement:
-    model = load(job.path, **job.load)
-    limit = MemoryLimit.of(job.max_memory)
+    model = load(job.path, **job.options.load)
+    limit = MemoryLimit.of(job.options.max_memory)
     started = time.perf_counter()
     warm_up().triangles()
     warm = time.perf_counter() - started
-    idle = resident_memory()
 
     def run() -> tuple[Extraction, Seconds]:
         extraction = extract_surface(
@@ -80,70 +76,47 @@ def _measure_exact(job: Job) -> Measurement:
         extraction.surface.triangles()
         return extraction, {**extraction.seconds, "tessellate": time.perf_counter() - started}
 
-    extraction, seconds, total = _repeat(run, job.repeat)
-    peak = peak_memory()
-    surface = extraction.surface
+    timed = _repeat(run, job.options.repeat)
+    surface = timed.result.surface
     invariants = check_invariants(surface, bounds=model.bounds)
-    return Measurement(
-        method=EXACT,
-        resolution=None,
-        preparation=dict(model.seconds),
-        warm_up=warm,
-        seconds=seconds,
-        total=total,
-        peak_bytes=peak,
-        idle_bytes=idle,
-        polygons=surface.n_polygons,
-        triangles=surface.n_corners - 2 * surface.n_polygons,
-        vertices=surface.n_vertices,
-        corners=surface.n_corners,
-        components=len(invariants.components),
-        euler=invariants.euler,
-        **_quality(job, model, surface),
-        note="; ".join(invariants.problems()),
-    )
+    note = "; ".join(invariants.problems())
+    found = _measured(job, model, surface, timed, dict(model.seconds), warm, note)
+    return replace(found, components=len(invariants.components), euler=invariants.euler)
 
 
 def _measure_cubes(job: Job, resolution: int) -> Measurement:
-    model = load(job.path, **job.load)
+    model = load(job.path, **job.options.load)
     started = time.perf_counter()
-    runtime, note = open_runtime(model, job.load, job.threads)
+    runtime, note = open_runtime(model, job.options.load, job.threads)
     opened = time.perf_counter()
     sampler = fastest(runtime, note, model.lower, model.upper)
     marching_cubes(sampler.evaluate, model.level, model.lower, model.upper, 8)
     warm = time.perf_counter() - opened
-    idle = resident_memory()
 
     def run() -> tuple[Cubes, Seconds]:
         cubes = marching_cubes(sampler.evaluate, model.level, model.lower, model.upper, resolution)
         return cubes, cubes.seconds
 
-    cubes, seconds, total = _repeat(run, job.repeat)
-    peak = peak_memory()
-    corners = cubes.triangles.reshape(-1)
-    surface = Surface.from_polygons(cubes.vertices, np.arange(len(cubes.triangles) + 1) * 3, corners)
-    return Measurement(
-        method=CUBES,
-        resolution=resolution,
-        preparation={"session": opened - started},
-        warm_up=warm,
-        seconds=seconds,
-        total=total,
-        peak_bytes=peak,
-        idle_bytes=idle,
-        polygons=surface.n_polygons,
-        triangles=surface.n_polygons,
-        vertices=surface.n_vertices,
-        corners=corners.size,
-        components=None,
-        euler=None,
-        **_quality(job, model, surface),
-        note=note,
-    )
+    timed = _repeat(run, job.options.repeat)
+    triangles = timed.result.triangles
+    surface = Surface.from_polygons(timed.result.vertices, np.arange(len(triangles) + 1) * 3, triangles.reshape(-1))
+    return _measured(job, model, surface, timed, {"session": opened - started}, warm, note)
 
 
-def _repeat(run: Callable[[], tuple[Result, Seconds]], times: int) -> tuple[Result, Seconds, float]:
-    """The last result, the median seconds of each phase, and the median of the sums."""
+@dataclass(frozen=True, eq=False)
+class _Timed(Generic[Result]):
+    """Runs of one method: the last ``result``, and the rest as in `Measurement`."""
+
+    result: Result
+    seconds: Seconds
+    total: float
+    peak_bytes: int | None
+    idle_bytes: int
+
+
+def _repeat(run: Callable[[], tuple[Result, Seconds]], times: int) -> _Timed[Result]:
+    """Run ``times`` times; the seconds of each phase, and the sums, are medians."""
+    idle = resident_memory()
     taken = []
     result, seconds = run()
     taken.append(seconds)
@@ -152,9 +125,36 @@ def _repeat(run: Callable[[], tuple[Result, Seconds]], times: int) -> tuple[Resu
         result, seconds = run()
         taken.append(seconds)
     phases = {phase: statistics.median(entry[phase] for entry in taken) for phase in seconds}
-    return result, phases, statistics.median(sum(entry.values()) for entry in taken)
+    return _Timed(result, phases, statistics.median(sum(entry.values()) for entry in taken), peak_memory(), idle)
 
 
-def _quality(job: Job, model: Model, surface: Surface) -> dict[str, float | None]:
-    recall = None if job.reference is None else soft_recall(reference_points(job.reference), surface)
-    return {"soft_precision": soft_precision(model, surface, job.samples), "soft_recall": recall}
+def _measured(
+    job: Job,
+    model: Model,
+    surface: Surface,
+    timed: _Timed[Result],
+    preparation: Seconds,
+    warm_up: float,
+    note: str,
+) -> Measurement:
+    """The measurement of a method that gave ``surface``, with the quality of that."""
+    reference = job.options.reference
+    return Measurement(
+        method=EXACT if job.resolution is None else CUBES,
+        resolution=job.resolution,
+        preparation=preparation,
+        warm_up=warm_up,
+        seconds=timed.seconds,
+        total=timed.total,
+        peak_bytes=timed.peak_bytes,
+        idle_bytes=timed.idle_bytes,
+        polygons=surface.n_polygons,
+        triangles=surface.n_corners - 2 * surface.n_polygons,
+        vertices=surface.n_vertices,
+        corners=surface.n_corners,
+        components=None,
+        euler=None,
+        soft_precision=soft_precision(model, surface, job.options.samples),
+        soft_recall=None if reference is None else soft_recall(reference_points(reference), surface),
+        note=note,
+    )
