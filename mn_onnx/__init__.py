@@ -7,10 +7,12 @@ store surfaces. Errors derive from `MnOnnxError`. Names are imported on first us
 from __future__ import annotations
 
 from importlib import import_module
+from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 import mn_onnx.extract as _extract_package
+from mn_onnx.kernel_cache import ensure_place_for_kernels, user_cache
 
 if TYPE_CHECKING:
     from mn_onnx.errors import CheckFailed, MnOnnxError, ModelRefused, Problem, UsageError
@@ -67,6 +69,8 @@ class _CallablePackage(ModuleType):
 
 
 _extract_package.__class__ = _CallablePackage
+
+ensure_place_for_kernels(Path(__file__).parent, user_cache())
 
 
 def __getattr__(name: str) -> Any:

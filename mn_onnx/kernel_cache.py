@@ -1,0 +1,54 @@
+"""Where compiled kernels are kept when numba would find no place for them."""
+
+from __future__ import annotations
+
+import os
+import stat
+import sys
+from pathlib import Path
+
+VARIABLE = "NUMBA_CACHE_DIR"
+
+
+def ensure_place_for_kernels(package: Path, user_cache: Path) -> Path | None:
+    """Name a folder to numba if it would have none and fail: returns it, or None where numba finds one by itself.
+
+    numba keeps compiled kernels beside their source in ``package``, else below ``user_cache``, else it raises, as for
+    a service that runs an installation of another user and has no home.
+    """
+    if os.environ.get(VARIABLE) or _takes_files(package) or _takes_files(user_cache):
+        return None
+    folder = _private_folder()
+    os.environ[VARIABLE] = str(folder)
+    if "numba" in sys.modules:  # it has read the environment already
+        sys.modules["numba"].config.CACHE_DIR = str(folder)
+    return folder
+
+
+def user_cache() -> Path:
+    """The folder in which programs keep what they can make again, as numba chooses it."""
+    if sys.platform == "win32":
+        return Path(os.environ.get("LOCALAPPDATA") or os.path.expanduser("~"))
+    if sys.platform == "darwin":
+        return Path(os.path.expanduser("~/Library/Caches"))
+    return Path(os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache"))
+
+
+def _takes_files(folder: Path) -> bool:
+    """Whether this process may write in ``folder``, or may create it."""
+    existing = next((place for place in (folder, *folder.parents) if place.exists()), folder)
+    return existing.is_dir() and os.access(existing, os.W_OK | os.X_OK)
+
+
+def _private_folder() -> Path:
+    """A folder for temporary files that no other user can write to: what numba reads from it is run."""
+    import tempfile
+
+    if not hasattr(os, "getuid"):  # Windows: the folder for temporary files is the user's own
+        return Path(tempfile.gettempdir()) / "mn-onnx"
+    folder = Path(tempfile.gettempdir()) / f"mn-onnx-{os.getuid()}"
+    folder.mkdir(mode=0o700, exist_ok=True)
+    status = folder.lstat()
+    if stat.S_ISDIR(status.st_mode) and status.st_uid == os.getuid() and not status.st_mode & 0o022:
+        return folder
+    return Path(tempfile.mkdtemp(prefix="mn-onnx-"))
