@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from typing import TypedDict, Unpack
 
 import numpy as np
 from numpy.typing import NDArray
 
+from mn_onnx.extract.clock import PhaseClock
 from mn_onnx.extract.degeneracy.box_copies import drop_box_copies
 from mn_onnx.extract.degeneracy.contract import contract_short_edges
 from mn_onnx.extract.degeneracy.flat import FlatRegions, find_flat_regions
@@ -70,7 +69,7 @@ class Extraction:
     seconds: dict[str, float]
 
 
-@dataclass
+@dataclass(frozen=True, eq=False)
 class _Run:
     """One call's arguments and clock."""
 
@@ -78,15 +77,7 @@ class _Run:
     upper: Floats
     threads: int | None
     progress: Callable[[Progress], None] | None
-    on_phase: Callable[[str], None]
-    seconds: dict[str, float] = field(default_factory=dict)
-
-    @contextmanager
-    def phase(self, name: str) -> Iterator[None]:
-        self.on_phase(name)
-        started = time.perf_counter()
-        yield
-        self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - started
+    clock: PhaseClock
 
     @property
     def coincidence(self) -> float:
@@ -123,26 +114,27 @@ def extract_surface(network: Network, lower: Floats, upper: Floats, **options: U
         np.asarray(upper, np.float64),
         options.get("threads"),
         options.get("progress"),
-        options.get("on_phase", lambda _: None),
+        PhaseClock(options.get("on_phase", lambda _: None)),
     )
-    with run.phase("traverse"):
+    clock = run.clock
+    with clock.phase("traverse"):
         soup, statistics = traverse(network, run.lower, run.upper, threads=run.threads, progress=run.progress)
-    with run.phase("weld"):
+    with clock.phase("weld"):
         surface, degeneracy = _as_it_is(soup, statistics.broken_cuts, run)
         del soup
     flat_regions = FlatRegions()
     if not degeneracy.found:
-        with run.phase("flat"):
+        with clock.phase("flat"):
             flat_regions = find_flat_regions(network, run.lower, run.upper, surface)
         if flat_regions:
             # A surface that borders on zeros lies in a plane where pieces of f meet: rounding may lose all of it.
             degeneracy = replace(degeneracy, found=("f is zero throughout a part of the box",))
     if degeneracy.found:
-        with run.phase("perturb"):
+        with clock.phase("perturb"):
             surface, degeneracy = _in_the_limit(network, run, surface, degeneracy)
-        with run.phase("flat"):
+        with clock.phase("flat"):
             flat_regions = find_flat_regions(network, run.lower, run.upper, surface)
-    return Extraction(surface, statistics, degeneracy, flat_regions, run.seconds)
+    return Extraction(surface, statistics, degeneracy, flat_regions, clock.seconds)
 
 
 def _as_it_is(soup: PolygonSoup, broken_cuts: int, run: _Run) -> tuple[Surface, Degeneracy]:

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import time
-from collections.abc import Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 from mn_onnx.errors import CheckFailed, UsageError
+from mn_onnx.extract.clock import PhaseClock
 from mn_onnx.extract.pipeline import RunOptions
 from mn_onnx.extract.schedule import Progress
 from mn_onnx.memory import MemoryLimit
@@ -19,23 +17,16 @@ from mn_onnx.runtime import Runtime
 from mn_onnx.warmup import warm_up
 
 
-@dataclass
-class Phases:
-    """Tells the listener which phase begins, and keeps the time of each in ``seconds``."""
+class Phases(PhaseClock):
+    """The clock of a run whose ``listener``, if there is one, is told of each phase and of progress within it."""
 
-    listener: ProgressCallback | None
-    seconds: dict[str, float] = field(default_factory=dict)
+    def __init__(self, listener: ProgressCallback | None) -> None:
+        super().__init__(lambda phase: self.announce(ProgressEvent(phase)))
+        self.listener = listener
 
     def announce(self, event: ProgressEvent) -> None:
         if self.listener is not None:
             self.listener(event)
-
-    @contextmanager
-    def phase(self, name: str) -> Iterator[None]:
-        self.announce(ProgressEvent(name))
-        started = time.perf_counter()
-        yield
-        self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - started
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,10 +49,7 @@ class Run:
             self.limit.check(event.polygons, event.corners)
             self.phases.announce(ProgressEvent("traverse", event.nodes, event.polygons))
 
-        def announce(phase: str) -> None:
-            self.phases.announce(ProgressEvent(phase))
-
-        return {"threads": self.threads, "progress": listen, "on_phase": announce}
+        return {"threads": self.threads, "progress": listen, "on_phase": self.phases.on_phase}
 
 
 def loaded(source: Model | ModelSource, options: LoadOptions, phases: Phases) -> Model:
