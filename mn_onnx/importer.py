@@ -18,7 +18,7 @@ from mn_onnx.ir.network import AffineRow, Floats, Integers, Network, Unit
 from mn_onnx.layout import BoundInput, Layout, Output, PointInput, point_count
 from mn_onnx.lowering import LOWERINGS, REFUSALS
 from mn_onnx.lowering.context import Context, GraphValue, Scope
-from mn_onnx.structure import opset_versions
+from mn_onnx.reader.structure import opset_versions
 from mn_onnx.symbolic import (
     CONSTANT,
     NO_POINT,
@@ -29,7 +29,7 @@ from mn_onnx.symbolic import (
     is_float,
     lift,
 )
-from mn_onnx.symbolic_store import Store
+from mn_onnx.symbolic.store import Store
 
 FREE_BATCHES = (2, 5)
 """A model of any number of points is run with these numbers; it must compute the same function with both."""

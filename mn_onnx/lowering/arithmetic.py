@@ -13,8 +13,8 @@ from mn_onnx.lowering.context import Context
 from mn_onnx.lowering.node import Node, UnsupportedNode
 from mn_onnx.lowering.table import Table, same
 from mn_onnx.symbolic import Constant, Tensor, is_float, lift
-from mn_onnx.symbolic_algebra import Algebra
-from mn_onnx.symbolic_compose import BOOL
+from mn_onnx.symbolic.algebra import Algebra
+from mn_onnx.symbolic.compose import BOOL
 
 Binary = Callable[[Algebra, Tensor, Tensor], Tensor]
 TRUE, FALSE = constant(1.0), constant(0.0)

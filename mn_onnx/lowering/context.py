@@ -13,10 +13,10 @@ from mn_onnx.errors import Problem
 from mn_onnx.lowering.fold import fold
 from mn_onnx.lowering.node import Node, OpaqueInput, UnsupportedNode, decode_attributes, read_tensor
 from mn_onnx.lowering.table import Lowering, Refusal
-from mn_onnx.structure import node_label
+from mn_onnx.reader.structure import node_label
 from mn_onnx.symbolic import CONSTANT, Constant, Opaque, Tensor, TooLargeError, lower
-from mn_onnx.symbolic_algebra import Algebra
-from mn_onnx.symbolic_store import Store
+from mn_onnx.symbolic.algebra import Algebra
+from mn_onnx.symbolic.store import Store
 
 GraphValue = Constant | Tensor | Opaque | list[Any]
 Scope = dict[str, GraphValue]

@@ -16,7 +16,7 @@ from mn_onnx.lowering.node import Node, UnsupportedNode
 from mn_onnx.lowering.quantised import dequantize, matmul_of_packed_weights
 from mn_onnx.lowering.table import Table, same
 from mn_onnx.symbolic import Constant, Tensor, concatenate, lift, rearrange
-from mn_onnx.symbolic_linear import matmul
+from mn_onnx.symbolic.linear import matmul
 
 FLOAT32 = np.dtype(np.float32)
 

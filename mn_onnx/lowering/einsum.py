@@ -12,7 +12,7 @@ from mn_onnx.lowering.context import Context
 from mn_onnx.lowering.node import Node, UnsupportedNode
 from mn_onnx.lowering.table import Table, same
 from mn_onnx.symbolic import Constant, Tensor, rearrange
-from mn_onnx.symbolic_linear import matmul
+from mn_onnx.symbolic.linear import matmul
 
 Operand = tuple[str, Constant | Tensor]
 """One letter per axis, and the tensor."""

@@ -13,7 +13,7 @@ from mn_onnx.lowering.node import Node, UnsupportedNode
 from mn_onnx.lowering.reduction import normal_axis
 from mn_onnx.lowering.table import Table, same
 from mn_onnx.symbolic import Constant, Tensor, check_size, concatenate, lift, lower, rearrange
-from mn_onnx.symbolic_algebra import Algebra
+from mn_onnx.symbolic.algebra import Algebra
 
 Movable = Constant | Tensor
 Indices = NDArray[np.int64]

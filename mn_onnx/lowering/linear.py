@@ -12,7 +12,7 @@ from mn_onnx.lowering.node import Node, UnsupportedNode
 from mn_onnx.lowering.table import Lowering, Table, same
 from mn_onnx.lowering.windows import Windows, gather_windows
 from mn_onnx.symbolic import Constant, Tensor, concatenate, lift, rearrange
-from mn_onnx.symbolic_linear import matmul as product
+from mn_onnx.symbolic.linear import matmul as product
 
 
 def gemm(context: Context, node: Node) -> Constant | Tensor:

@@ -9,7 +9,7 @@ from mn_onnx.lowering.node import Node, UnsupportedNode
 from mn_onnx.lowering.reduction import normal_axis
 from mn_onnx.lowering.table import Table, same
 from mn_onnx.symbolic import Constant, Tensor, is_float
-from mn_onnx.symbolic_linear import matmul
+from mn_onnx.symbolic.linear import matmul
 
 
 def dequantize(_context: Context, node: Node) -> Constant:

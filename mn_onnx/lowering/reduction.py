@@ -14,7 +14,7 @@ from mn_onnx.lowering.node import Node, UnsupportedNode
 from mn_onnx.lowering.table import Lowering, Table, same
 from mn_onnx.lowering.windows import Windows, gather_windows
 from mn_onnx.symbolic import Constant, Opaque, Tensor, join, lift
-from mn_onnx.symbolic_linear import contract
+from mn_onnx.symbolic.linear import contract
 
 Reducer = Callable[[Context, Tensor], Tensor]
 """Reduces [rows, k] to [rows]."""

@@ -10,9 +10,9 @@ import numpy as np
 
 from mn_onnx.ir.expression import apply, constant
 from mn_onnx.symbolic import CONSTANT, IDENTITY, Tensor, check_size, join
-from mn_onnx.symbolic_compose import BOOL, Builder, Composer
-from mn_onnx.symbolic_elements import Mask, assign, copy, drop_zero_scales
-from mn_onnx.symbolic_store import Rows
+from mn_onnx.symbolic.compose import BOOL, Builder, Composer
+from mn_onnx.symbolic.elements import Mask, assign, copy, drop_zero_scales
+from mn_onnx.symbolic.store import Rows
 
 
 class Algebra(Composer):

@@ -10,8 +10,8 @@ from mn_onnx.ir.expression import Expression, T, constant
 from mn_onnx.ir.network import KnotTable
 from mn_onnx.ir.scalar import UndefinedFunction, discontinuities, evaluate, simplify
 from mn_onnx.symbolic import CONSTANT, IDENTITY, NO_POINT, Array, Tensor, check_size, groups
-from mn_onnx.symbolic_elements import Mask, affine, assign, copy, empty, substitute
-from mn_onnx.symbolic_store import Store
+from mn_onnx.symbolic.elements import Mask, affine, assign, copy, empty, substitute
+from mn_onnx.symbolic.store import Store
 
 Builder = Callable[..., Expression]
 

@@ -11,9 +11,9 @@ import onnx
 import onnx.inliner
 
 from mn_onnx.errors import ModelRefused, Problem, UsageError
-from mn_onnx.formats import PROTOBUF_LIMIT, decode
-from mn_onnx.structure import interface_problems, node_problems, opset_problems, opset_versions, sort_nodes
-from mn_onnx.tensors import (
+from mn_onnx.reader.formats import PROTOBUF_LIMIT, decode
+from mn_onnx.reader.structure import interface_problems, node_problems, opset_problems, opset_versions, sort_nodes
+from mn_onnx.reader.tensors import (
     densify_constants,
     densify_initializers,
     embed_external_data,

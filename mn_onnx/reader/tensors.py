@@ -12,7 +12,7 @@ import onnx
 from onnx import external_data_helper, numpy_helper
 
 from mn_onnx.errors import Problem
-from mn_onnx.formats import PROTOBUF_LIMIT
+from mn_onnx.reader.formats import PROTOBUF_LIMIT
 
 _STORE_ANEW = (
     "export the model again, or store its weights inside the file (onnx.save with save_as_external_data=False)"

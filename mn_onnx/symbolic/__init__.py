@@ -1,7 +1,7 @@
 """Tensors whose elements are functions of one point: what the importer computes with in place of numbers.
 
 An element is ``scale * function(t) + offset``, where ``t`` is a *base*: an affine row over the variables of one point
-(its coordinates, then unit outputs). Bases and functions are numbers of entries in a `mn_onnx.symbolic_store.Store`.
+(its coordinates, then unit outputs). Bases and functions are numbers of entries in a `mn_onnx.symbolic.store.Store`.
 Elements of different points that compute the same function hold the same entries and differ in ``point`` alone.
 """
 

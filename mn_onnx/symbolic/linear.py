@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mn_onnx.symbolic import CONSTANT, NO_POINT, Constant, Tensor, check_size, join, lift
-from mn_onnx.symbolic_algebra import Algebra
+from mn_onnx.symbolic.algebra import Algebra
 
 Floats = NDArray[np.float64]
 
