@@ -160,7 +160,7 @@ def run_inspect(options: argparse.Namespace) -> int:
 
 def run_verify(options: argparse.Namespace) -> int:
     """``mn-onnx verify``: print the checks of a mesh file; returns 0, or raises `CheckFailed`."""
-    from mn_onnx.verification import verify
+    from mn_onnx.checks.verification import verify
 
     model = load(options.model, **_load_options(options))
     result = verify(options.mesh, model, tolerance=options.tolerance, threads=options.threads)

@@ -4,16 +4,16 @@ from __future__ import annotations
 
 from typing import Any, Unpack
 
+from mn_onnx.checks.findings import findings
+from mn_onnx.checks.residual import measure_residuals, true_residuals
 from mn_onnx.errors import CheckFailed, UsageError
 from mn_onnx.extract.invariants import check_invariants
 from mn_onnx.extract.pipeline import extract_surface
 from mn_onnx.extract.surface import Surface
-from mn_onnx.findings import findings
 from mn_onnx.model import LoadOptions, Model
 from mn_onnx.progress import ProgressCallback
 from mn_onnx.reader import ModelSource
 from mn_onnx.report import build_report
-from mn_onnx.residual import measure_residuals, true_residuals
 from mn_onnx.run import Phases, loaded, prepare
 from mn_onnx.surrogates import NOT_CERTIFIED, certified, polished
 

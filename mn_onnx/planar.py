@@ -8,18 +8,18 @@ from typing import Any, Unpack
 import numpy as np
 from numpy.typing import NDArray
 
+from mn_onnx.checks.findings import empty_level_set
+from mn_onnx.checks.runtime import Runtime
 from mn_onnx.errors import CheckFailed, UsageError
 from mn_onnx.extract.pipeline import Extraction
 from mn_onnx.extract.planar.curve import Curve, Roots
 from mn_onnx.extract.planar.prism import extract_curve, extract_roots
-from mn_onnx.findings import empty_level_set
 from mn_onnx.ir.evaluate import evaluate, float64_error_bound
 from mn_onnx.model import LoadOptions, Model
 from mn_onnx.progress import ProgressCallback
 from mn_onnx.reader import ModelSource
 from mn_onnx.report import model_entries, parity_entries
 from mn_onnx.run import Phases, Run, loaded, prepare
-from mn_onnx.runtime import Runtime
 
 Floats = NDArray[np.float64]
 

@@ -35,12 +35,12 @@ from importlib.metadata import version
 from typing import Any
 
 from mn_onnx import __version__
+from mn_onnx.checks.parity import Parity
+from mn_onnx.checks.residual import Residuals
 from mn_onnx.extract.invariants import Invariants
 from mn_onnx.extract.pipeline import Extraction
 from mn_onnx.model import Model
-from mn_onnx.parity import Parity
 from mn_onnx.profile import profile_entries
-from mn_onnx.residual import Residuals
 
 
 def model_entries(model: Model) -> dict[str, Any]:

@@ -4,16 +4,16 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from mn_onnx.checks.parity import Parity, check_parity
+from mn_onnx.checks.runtime import Runtime
 from mn_onnx.errors import CheckFailed, UsageError
 from mn_onnx.extract.clock import PhaseClock
 from mn_onnx.extract.pipeline import RunOptions
 from mn_onnx.extract.schedule import Progress
 from mn_onnx.memory import MemoryLimit
 from mn_onnx.model import LoadOptions, Model, load
-from mn_onnx.parity import Parity, check_parity
 from mn_onnx.progress import ProgressCallback, ProgressEvent
 from mn_onnx.reader import ModelSource
-from mn_onnx.runtime import Runtime
 from mn_onnx.warmup import warm_up
 
 

@@ -24,8 +24,8 @@ from mn_onnx.bench.run import in_fresh_process
 from mn_onnx.bench.sampler import fastest, open_runtime
 from mn_onnx.bench.table import markdown
 from mn_onnx.bench.worker import Failure, Job
+from mn_onnx.checks.runtime import Runtime
 from mn_onnx.cli import EXIT_CHECK, EXIT_USAGE, main
-from mn_onnx.runtime import Runtime
 
 Floats = NDArray[np.float64]
 BOX = (np.full(3, -1.0), np.ones(3))

@@ -10,8 +10,8 @@ import pytest
 from small_models import octahedron_model
 
 import mn_onnx
-from mn_onnx.residual import FACE_SAMPLES, measure_residuals
-from mn_onnx.verification import verify
+from mn_onnx.checks.residual import FACE_SAMPLES, measure_residuals
+from mn_onnx.checks.verification import verify
 
 
 @pytest.fixture(scope="module")

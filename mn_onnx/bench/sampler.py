@@ -9,9 +9,9 @@ import numpy as np
 import onnx
 from numpy.typing import NDArray
 
+from mn_onnx.checks.runtime import Runtime
 from mn_onnx.errors import CheckFailed, MnOnnxError
 from mn_onnx.model import LoadOptions, Model, load
-from mn_onnx.runtime import Runtime
 
 Floats = NDArray[np.float64]
 

@@ -8,12 +8,12 @@ import numpy as np
 import onnx
 from numpy.typing import NDArray
 
+from mn_onnx.checks.runtime import Runtime
 from mn_onnx.ir.evaluate import float32_error_bound
 from mn_onnx.ir.evaluator import Evaluator
 from mn_onnx.layout import PointInput
 from mn_onnx.model import Model
 from mn_onnx.reader.tensors import model_tensors
-from mn_onnx.runtime import Runtime
 
 Floats = NDArray[np.float64]
 

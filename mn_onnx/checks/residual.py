@@ -7,11 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from mn_onnx.checks.runtime import Runtime
 from mn_onnx.extract.sampling import sample_surface
 from mn_onnx.extract.surface import Surface
 from mn_onnx.ir.evaluate import evaluate, float64_error_bound, gradient
 from mn_onnx.model import Model
-from mn_onnx.runtime import Runtime
 
 Floats = NDArray[np.float64]
 
@@ -19,7 +19,7 @@ FACE_SAMPLES = 1 << 15
 
 MOST_VERTICES = 1 << 16
 """An extraction measures this many of its vertices, chosen at random: a fault of one vertex in 10,000 escapes it with a
-probability of exp(-6.5), or 0.15 %. `mn_onnx.verification.verify` measures them all."""
+probability of exp(-6.5), or 0.15 %. `mn_onnx.checks.verification.verify` measures them all."""
 
 JUDGED_POINTS = 1 << 10
 """|f| is compared with its rounding bound, which costs more than |f|, at this many points where |f| is largest."""

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from mn_onnx.checks.parity import Parity
+from mn_onnx.checks.residual import Residuals
 from mn_onnx.extract.invariants import Invariants
 from mn_onnx.extract.pipeline import Extraction
 from mn_onnx.model import Model
-from mn_onnx.parity import Parity
-from mn_onnx.residual import Residuals
 
 GRID_POINTS = 30_000
 """About so many values of the output are looked at for the one that is nearest to a level without a surface."""

@@ -7,14 +7,14 @@ from typing import Any
 
 import numpy as np
 
+from mn_onnx.checks.parity import check_parity
+from mn_onnx.checks.residual import measure_residuals
+from mn_onnx.checks.runtime import Runtime
 from mn_onnx.errors import UsageError
 from mn_onnx.extract.files import MeshFileError, read_mesh
 from mn_onnx.extract.invariants import check_invariants, mark_box_edges
 from mn_onnx.model import Model
-from mn_onnx.parity import check_parity
 from mn_onnx.report import check_entries, model_entries
-from mn_onnx.residual import measure_residuals
-from mn_onnx.runtime import Runtime
 
 FLOAT32_ROUNDING = float(np.finfo(np.float32).eps) / 2
 
