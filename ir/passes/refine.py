@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from mn_onnx.ir.certify import Certificate, certify
+from mn_onnx.ir.certify import DEFAULT_WORK, Certificate, certify
 from mn_onnx.ir.levels import level_blocks
 from mn_onnx.ir.network import KnotTable, Network
 from mn_onnx.ir.passes.contract import Program
@@ -20,8 +20,10 @@ MOST_KNOTS_PER_UNIT = 4096
 # Each round aims below the tolerance, because the next ranges and sensitivities are not known yet.
 AIM = 0.7
 LEAST_FACTOR = 2.0**-10
-# A round that gains less than this has met a limit that knots do not move.
+# Two rounds that gain less than this have met a limit that knots do not move.
 LEAST_GAIN = 0.95
+# Of a round's proof: several rounds with more knots reach the tolerance sooner than one with more boxes.
+ROUND_WORK = DEFAULT_WORK / 4
 
 
 class ToleranceNotReached(ValueError):
@@ -80,8 +82,9 @@ def refine(program: Program, tabulated: Program, tolerance: float) -> tuple[Prog
 
     ``tabulated``: a first attempt, with the default surrogates. Raises `ToleranceNotReached` with the reason.
     """
-    current = tabulated
-    certificate = certify(current.network, program.lower, program.upper, target=tolerance)
+    current, lower, upper = tabulated, program.lower, program.upper
+    certificate = certify(current.network, lower, upper, target=tolerance, work=ROUND_WORK)
+    was_stuck = False
     for _ in range(MOST_ROUNDS):
         if certificate.error <= tolerance:
             return current, certificate
@@ -98,11 +101,12 @@ def refine(program: Program, tabulated: Program, tolerance: float) -> tuple[Prog
             finer = tabulate(replace(program, tolerances=tolerances))
         except UndefinedFunction as fault:
             raise _failure(current.network, certificate, tolerance, str(fault)) from fault
-        finer_certificate = certify(finer.network, program.lower, program.upper, target=tolerance)
-        stuck = finer_certificate.error > LEAST_GAIN * certificate.error
+        finer_certificate = certify(finer.network, lower, upper, target=tolerance, work=ROUND_WORK)
+        is_stuck = finer_certificate.error > max(tolerance, LEAST_GAIN * certificate.error)
         current, certificate = finer, finer_certificate
-        if stuck:
+        if is_stuck and was_stuck:
             raise _failure(current.network, certificate, tolerance, "more knots no longer improve the proof")
+        was_stuck = is_stuck
     if certificate.error <= tolerance:
         return current, certificate
     raise _failure(current.network, certificate, tolerance, f"{MOST_ROUNDS} rounds of refinement were not enough")
