@@ -42,13 +42,16 @@ class TerminalProgress:
         self._cells = self._polygons = 0
 
     def __enter__(self) -> Self:
-        self._progress.start()
+        if not self._progress.disable:
+            self._progress.start()
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
-        self._progress.stop()
+        # Rich before version 14 ends even a bar that was never drawn with a new line.
+        if not self._progress.disable:
+            self._progress.stop()
 
     def __call__(self, event: ProgressEvent) -> None:
         # Phases after the traversal count nothing themselves: the bar keeps what was found.
