@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from mn_onnx.extract.blocks import BLOCK_SIZE, Indices, block_count, group_items, index_dtype, run_blocks
 
-_MAX_PARTITIONS = 1 << 16
-_CORNERS_PER_PARTITION = 1 << 13
+_MAX_PARTITIONS = 1 << 16  # their numbers fit in uint16
+_CORNERS_PER_PARTITION = 1 << 13  # whose counters fit in the cache of a core
 
 
 def half_edge_heads(offsets: NDArray[np.int64], corners: Indices) -> Indices:

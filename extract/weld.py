@@ -30,8 +30,9 @@ POSITION_AGREEMENT = 1e-9
 
 Floats = NDArray[np.float64]
 
-_CORNERS_PER_PARTITION = 1 << 12
-_MAX_PARTITION_BITS = 16
+_CORNERS_PER_PARTITION = 1 << 12  # whose hash table fits in the cache of a core
+_MAX_PARTITION_BITS = 16  # partition numbers fit in uint16
+# Odd constants whose bits look random: xxHash's second prime, and 2^64 over the golden ratio (Knuth, volume 3, 6.4).
 _KEY_MIX = 0xC2B2AE3D27D4EB4F
 _GOLDEN = 0x9E3779B97F4A7C15
 

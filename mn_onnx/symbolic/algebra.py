@@ -6,6 +6,8 @@ and joined by maximum and minimum. Their product is no affine combination and is
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 
 from mn_onnx.ir.expression import apply, constant
@@ -143,17 +145,7 @@ class Algebra(Composer):
         """Truth of ``less``, ``less_equal`` or ``equal`` for every element."""
 
         def choose(a: Tensor, b: Tensor) -> Tensor:
-            related = ~(a.live & b.live) | self._related(a, b)
-            result = copy(a)
-            direct = self._compose([a[related], b[related]], lambda p, q: apply(operation, p, q))
-            assign(result, related, direct, packed=True)
-            if not related.all():
-                difference = self._add_rows(a[~related], b[~related], -1.0)
-                outcome = self._elementwise(
-                    [difference],
-                    lambda d: self._compose([d], lambda p: apply(operation, p, constant(0.0))),
-                )
-                assign(result, ~related, outcome, packed=True)
+            result = self._composed(a, b, operation, lambda excess, _: excess)
             # An element compared with itself, as in tests for NaN.
             equal = (
                 a.live & (a.base == b.base) & (a.function == b.function) & (a.scale == b.scale) & (a.offset == b.offset)
@@ -167,22 +159,28 @@ class Algebra(Composer):
     def extremum(self, x: Tensor, y: Tensor, operation: str) -> Tensor:
         """``maximum`` or ``minimum`` of two tensors."""
 
-        def choose(a: Tensor, b: Tensor) -> Tensor:
-            related = ~(a.live & b.live) | self._related(a, b)
-            result = copy(a)
-            direct = self._compose([a[related], b[related]], lambda p, q: apply(operation, p, q))
-            assign(result, related, direct, packed=True)
-            if not related.all():
-                left, right = a[~related], b[~related]
-                excess = self._elementwise(
-                    [self._add_rows(left, right, -1.0)],
-                    lambda d: self._compose([d], lambda p: apply(operation, p, constant(0.0))),
-                )
-                total = self._elementwise([excess, right], lambda p, q: self._add(p, q, 1.0))
-                assign(result, ~related, total, packed=True)
-            return result
+        def above(excess: Tensor, y: Tensor) -> Tensor:
+            return self._elementwise([excess, y], lambda p, q: self._add(p, q, 1.0))
 
-        return self._binary(x, y, choose)
+        return self._binary(x, y, lambda a, b: self._composed(a, b, operation, above))
+
+    def _composed(self, x: Tensor, y: Tensor, operation: str, apart: Callable[[Tensor, Tensor], Tensor]) -> Tensor:
+        """``operation(x, y)`` where both are functions of one direction.
+
+        Elsewhere it is what ``apart`` makes of ``operation(x - y, 0)`` and ``y``.
+        """
+        related = ~(x.live & y.live) | self._related(x, y)
+        result = copy(x)
+        direct = self._compose([x[related], y[related]], lambda p, q: apply(operation, p, q))
+        assign(result, related, direct, packed=True)
+        if not related.all():
+            left, right = x[~related], y[~related]
+            excess = self._elementwise(
+                [self._add_rows(left, right, -1.0)],
+                lambda d: self._compose([d], lambda p: apply(operation, p, constant(0.0))),
+            )
+            assign(result, ~related, apart(excess, right), packed=True)
+        return result
 
     def where(self, condition: Tensor, x: Tensor, y: Tensor) -> Tensor:
         """``x`` where ``condition`` holds, else ``y``."""
