@@ -11,7 +11,7 @@ from mn_onnx.ir.levels import contiguous
 from mn_onnx.ir.network import Floats, Network
 from mn_onnx.ir.scalar.running_error import running_error
 
-HALF, SINGLE, DOUBLE = 2.0**-11, 2.0**-24, 2.0**-53
+SINGLE, DOUBLE = 2.0**-24, 2.0**-53
 # Operations per term besides the dot product itself: scaling, bias, normalisation and casts that were fused into a row.
 FUSED_OPERATIONS = 8
 
@@ -106,7 +106,7 @@ def _chunk_bound(evaluator: Evaluator, points: Floats, unit: float) -> Floats:
 
 
 def float32_error_bound(network: Network, points: Floats, *, unit_roundoff: float = SINGLE) -> Floats:
-    """`rounding_error_bound` of the true functions in float32 (``unit_roundoff=HALF``: float16), float64 [n]."""
+    """`rounding_error_bound` of the true functions in float32 (``unit_roundoff=2**-11``: float16), float64 [n]."""
     return rounding_error_bound(network, points, unit_roundoff=unit_roundoff)
 
 
