@@ -33,11 +33,12 @@ POSITION_ROUNDINGS = 4
 class Residuals:
     """|f| at vertices and random points of the faces, where f is zero on the level set.
 
-    ``points``: how many of both; of a large mesh not all vertices, see `MOST_VERTICES`. ``max_abs_f``, ``mean_abs_f``: over all, of the piecewise-linear f that was extracted,
-    in float64. ``allowed_abs_f``: the largest |f| that rounding explains at any point judged; ``worst_ratio``: the
-    largest ratio of |f| to what is explained at its own point. ``true_max_abs_f``, ``true_mean_abs_f``: over the points
-    of the faces, of the original output minus the level, with the true activations. ``ort_mean_abs_f``: the same by
-    ``runtime``, at points rounded to its precision; None where there is no comparison.
+    ``points``: how many of both; of a large mesh not all vertices, see `MOST_VERTICES`. ``max_abs_f``, ``mean_abs_f``:
+    over all, of the piecewise-linear f that was extracted, in float64. ``allowed_abs_f``: the largest |f| that rounding
+    explains at any point judged; ``worst_ratio``: the largest ratio of |f| to what is explained at its own point.
+    ``true_max_abs_f``, ``true_mean_abs_f``: over the points of the faces, of the original output minus the level, with
+    the true activations. ``ort_mean_abs_f``: the same by ``runtime``, at points rounded to its precision; None where
+    there is no comparison.
     """
 
     points: int
