@@ -130,6 +130,11 @@ def _parse_key(key: str, by_name: Mapping[str, GraphInput]) -> tuple[str, str | 
     return match["name"], match["columns"]
 
 
+def input_of_key(key: str, inputs: Sequence[GraphInput]) -> str:
+    """The input that a key of bound values names, whole or by columns. Raises `UsageError` if there is none."""
+    return _parse_key(key, {entry.name: entry for entry in inputs})[0]
+
+
 def _columns_of(spec: str, width: int, key: str) -> list[int]:
     columns: list[int] = []
     try:

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import argparse
+import functools
 import json
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -16,8 +17,7 @@ from mn_onnx.errors import CheckFailed, ModelRefused, UsageError
 from mn_onnx.memory import parse_size
 from mn_onnx.model import LoadOptions, Model, load
 from mn_onnx.progress import ProgressCallback
-from mn_onnx.reader import read_model
-from mn_onnx.series import count_rows, numbered, row_of
+from mn_onnx.series import Series, numbered, row_of
 from mn_onnx.summaries import mesh_summary, planar_summary
 
 
@@ -26,19 +26,24 @@ def run_extract(options: argparse.Namespace) -> int:
 
     Raises `CheckFailed`, after the report is written, if a check fails or the level set is empty; no mesh is then left.
     """
+    if options.all:
+        return _extract_rows(options)
+    return _extract_one(options, lambda: load(options.model, **_load_options(options)))
+
+
+def _extract_one(options: argparse.Namespace, load_model: Callable[[], Model]) -> int:
+    """`run_extract` of the model that ``load_model`` gives."""
     from mn_onnx.extract.blocks import resolve_threads
     from mn_onnx.extract.files import check_mesh_options, write_mesh
     from mn_onnx.extraction import extract
     from mn_onnx.profile import profile_text
     from mn_onnx.progress import ProgressEvent, TerminalProgress
 
-    if options.all:
-        return _extract_rows(options)
     if options.report is not None:
         _check_place("--report", options.report)
     with TerminalProgress(enabled=not options.quiet) as progress:
         progress(ProgressEvent("import"))
-        model = load(options.model, **_load_options(options))
+        model = load_model()
         if model.dimension < 3:
             return _extract_planar(options, model, progress)
         if model.fineness is not None and not options.quiet:
@@ -85,18 +90,15 @@ def run_extract(options: argparse.Namespace) -> int:
 
 
 def _extract_rows(options: argparse.Namespace) -> int:
-    """`run_extract` once for every row of the bound tables, of a model that is read once."""
-    bound = parse.bindings(options.bind)
-    n_rows = count_rows(bound)
-    read = read_model(options.model)
+    """`run_extract` for every row of the bound tables, of a graph that is read and lowered once."""
+    series = Series(options.model, **_load_options(options))
     failures = []
-    for row in range(n_rows):
+    for row in range(series.n_rows):
         single = argparse.Namespace(**vars(options))
-        single.all, single.row, single.model = False, row, read
-        single.mesh = numbered(options.mesh, row, n_rows)
-        single.report = None if options.report is None else numbered(options.report, row, n_rows)
+        single.mesh = numbered(options.mesh, row, series.n_rows)
+        single.report = None if options.report is None else numbered(options.report, row, series.n_rows)
         try:
-            run_extract(single)
+            _extract_one(single, functools.partial(series.model, row))
         except CheckFailed as error:
             failures += [f"row {row}: {problem}" for problem in error.problems]
     if failures:

@@ -3,31 +3,29 @@
 from __future__ import annotations
 
 import dataclasses
-import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
+from typing import TypedDict, Unpack
 
 import numpy as np
 import onnx
 import onnx.inliner
 from numpy.typing import ArrayLike
 
-from mn_onnx.binding import bind_inputs, graph_inputs, has_free_width, with_width
-from mn_onnx.errors import ModelRefused, Problem, UsageError
+from mn_onnx.binding import GraphInput, bind_inputs, graph_inputs, has_free_width, input_of_key, with_width
+from mn_onnx.errors import ModelRefused, Problem
+from mn_onnx.field import choose_channel, choose_output, output_problem
 from mn_onnx.ir.network import AffineRow, Floats, Integers, Network, Unit
-from mn_onnx.layout import BoundInput, Layout, Output, PointInput, point_count
+from mn_onnx.ir.substitute import with_fixed_inputs
+from mn_onnx.layout import BoundInput, Layout, Output, PointInput, parameter_values, point_count
 from mn_onnx.lowering import LOWERINGS, REFUSALS
-from mn_onnx.lowering.context import Context, GraphValue, Scope
+from mn_onnx.lowering.context import Context, Scope
 from mn_onnx.reader.structure import opset_versions
 from mn_onnx.symbolic import (
-    CONSTANT,
     NO_POINT,
     Constant,
-    Opaque,
     Tensor,
     check_size,
-    is_float,
-    lift,
 )
 from mn_onnx.symbolic.store import Store
 
@@ -37,6 +35,20 @@ WIDTHS = (3, 2, 1)
 """Numbers of columns that are tried where the model declares none."""
 MOST_POINTS = 4096
 """A static batch up to this size is run as it is; a larger one as if its size were free."""
+
+
+class ImportOptions(TypedDict, total=False):
+    """What to import of a model.
+
+    ``output``: the name of the output, needed where several give one value per point. ``channel``: its channel, needed
+    where it has several. ``bind``: extra inputs, or columns of the points (``"x[3:]"``), to constants. ``coordinates``:
+    which columns or inputs are the coordinates; see `mn_onnx.binding.bind_inputs`.
+    """
+
+    output: str | None
+    channel: int | None
+    bind: Mapping[str, ArrayLike] | None
+    coordinates: Sequence[int | str] | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,6 +66,43 @@ class Imported:
 
 
 @dataclass(frozen=True, eq=False)
+class Family:
+    """A model as a function of one point and of parameters, imported once: see `import_family`.
+
+    ``network``: over the coordinates of the point, then the parameters. ``inputs``: those of the graph.
+    """
+
+    network: Network
+    layout: Layout
+    metadata: dict[str, str]
+    inputs: tuple[GraphInput, ...]
+    coordinates: Sequence[int | str] | None
+    parameters: frozenset[str]
+
+    def member(self, bind: Mapping[str, ArrayLike]) -> Imported:
+        """The model with its parameters at the values in ``bind``, which binds what `import_family` was given.
+
+        Raises `UsageError` for values that do not fit.
+        """
+        roles, dim = bind_inputs(self.inputs, bind, self.coordinates)
+        values = [parameter_values(entry) for entry in roles if entry.name in self.parameters]
+        network = with_fixed_inputs(self.network, np.concatenate(values))
+        return Imported(network, dataclasses.replace(self.layout, inputs=roles), dim, self.metadata)
+
+
+@dataclass(frozen=True, eq=False)
+class _Request:
+    """What to import: the model, how it is fed, which output; ``first_parameter``: by input, of those left open."""
+
+    model: onnx.ModelProto
+    layout: Layout
+    output: str | None
+    channel: int | None
+    first_parameter: Mapping[str, int]
+    n_inputs: int
+
+
+@dataclass(frozen=True, eq=False)
 class _Run:
     """One symbolic run: the context after it, and the chosen output."""
 
@@ -62,74 +111,84 @@ class _Run:
     field: Tensor
 
 
-def import_network(
-    model: onnx.ModelProto,
-    *,
-    output: str | None = None,
-    channel: int | None = None,
-    bind: Mapping[str, ArrayLike] | None = None,
-    coordinates: Sequence[int | str] | None = None,
-) -> Imported:
+def import_network(model: onnx.ModelProto, **options: Unpack[ImportOptions]) -> Imported:
     """Import a model as a scalar function of one point.
 
-    ``model``: self-contained, as `mn_onnx.reader.read_model` gives it. ``output``: the name of the output, needed where
-    several give one value per point. ``channel``: its channel, needed where it has several. ``bind``: extra inputs, or
-    columns of the points (``"x[3:]"``), to constants. ``coordinates``: which columns or inputs are the coordinates; see
-    `mn_onnx.binding.bind_inputs`.
+    ``model``: self-contained, as `mn_onnx.reader.read_model` gives it. ``options``: see `ImportOptions`.
 
     Raises `ModelRefused` with every problem that reaches the chosen output, `UsageError` for names that do not fit.
     """
+    found = import_family(model, (), **options)
+    return Imported(found.network, found.layout, found.layout.dim, found.metadata)
+
+
+def import_family(model: onnx.ModelProto, parameters: Collection[str], **options: Unpack[ImportOptions]) -> Family:
+    """Import a model once for many values of its ``parameters``, which are keys of ``bind`` in ``options``.
+
+    Their values there only tell shapes.
+
+    Raises as `import_network`; also where a parameter is multiplied with the point, so that the model is piecewise
+    linear only once its value is known.
+    """
     if model.functions:
         model = onnx.inliner.inline_local_functions(model)
-    inputs, bound = graph_inputs(model), bind or {}
-    if not has_free_width(inputs, bound):
-        return _import(model, bind_inputs(inputs, bound, coordinates), output, channel)
+    inputs, bound, coordinates = graph_inputs(model), options.get("bind") or {}, options.get("coordinates")
+    choices = [with_width(inputs, width) for width in WIDTHS] if has_free_width(inputs, bound) else [inputs]
     refusals = []
-    for width in WIDTHS:
+    for choice in choices:
+        roles, dim = bind_inputs(choice, bound, coordinates)
+        open_ = frozenset(input_of_key(key, choice) for key in parameters)
         try:
-            return _import(model, bind_inputs(with_width(inputs, width), bound, coordinates), output, channel)
+            network, layout = _import(model, roles, dim, open_, options)
         except ModelRefused as error:
             refusals.append(error)
+            continue
+        metadata = {entry.key: entry.value for entry in model.metadata_props}
+        return Family(network, layout, metadata, tuple(choice), coordinates, open_)
     raise refusals[0]
 
 
 def _import(
     model: onnx.ModelProto,
-    roles: tuple[tuple[PointInput | BoundInput, ...], int],
-    output: str | None,
-    channel: int | None,
-) -> Imported:
-    inputs, dim = roles
+    inputs: tuple[PointInput | BoundInput, ...],
+    dim: int,
+    parameters: frozenset[str],
+    options: ImportOptions,
+) -> tuple[Network, Layout]:
     points = [entry for entry in inputs if isinstance(entry, PointInput)]
     batch = point_count(points[0].shape, points[0].axis)
     layout = Layout(inputs, dim, batch, Output("", None, 0))
+    first_parameter, n_inputs = {}, dim
+    for entry in inputs:
+        if entry.name in parameters:
+            first_parameter[entry.name] = n_inputs
+            n_inputs += parameter_values(entry).size
+    request = _Request(model, layout, options.get("output"), options.get("channel"), first_parameter, n_inputs)
     if batch is not None and batch <= MOST_POINTS:
-        run = _run(model, layout, batch, output, channel)
-        network = _network(run, dim)
+        run = _run(request, batch)
+        network = _network(run, n_inputs)
     else:
-        run, network = _run_with_two_batches(model, layout, output, channel)
-    metadata = {entry.key: entry.value for entry in model.metadata_props}
-    return Imported(network, dataclasses.replace(layout, output=run.output), dim, metadata)
+        run, network = _run_with_two_batches(request)
+    return network, dataclasses.replace(layout, output=run.output)
 
 
-def _run_with_two_batches(
-    model: onnx.ModelProto, layout: Layout, output: str | None, channel: int | None
-) -> tuple[_Run, Network]:
+def _run_with_two_batches(request: _Request) -> tuple[_Run, Network]:
     """Run with two batch sizes. Raises `ModelRefused`, naming the first node that differs, unless both agree."""
-    free = layout if layout.batch is None else _with_free_batch(layout)
+    layout = request.layout
+    free = request if layout.batch is None else dataclasses.replace(request, layout=_with_free_batch(layout))
     try:
-        first, second = (_run(model, free, n, output, channel) for n in FREE_BATCHES)
+        first, second = (_run(free, n) for n in FREE_BATCHES)
     except ModelRefused as error:
         if layout.batch is None:
             raise
-        problem = _problem(
+        problem = output_problem(
             "",
             f"the model takes {layout.batch} points at once, too many to be analysed, and not any other number",
             "export with a dynamic number of points",
         )
         raise ModelRefused([problem, *error.problems]) from error
-    network = _network(first, layout.dim)
-    if first.output != second.output or not _same(network, _network(second, layout.dim)):
+    network = _network(first, request.n_inputs)
+    if first.output != second.output or not _same(network, _network(second, request.n_inputs)):
         raise ModelRefused([_batch_problem(first.context, second.context)])
     return first, network
 
@@ -142,13 +201,16 @@ def _with_free_batch(layout: Layout) -> Layout:
     return dataclasses.replace(layout, inputs=tuple(entries), batch=None)
 
 
-def _run(model: onnx.ModelProto, layout: Layout, n: int, output: str | None, channel: int | None) -> _Run:
-    context = Context(Store(layout.dim), opset_versions(model), LOWERINGS, REFUSALS)
-    scope: Scope = {entry.name: _input_value(entry, n) for entry in layout.inputs}
-    names = [value.name for value in model.graph.output]
-    values = dict(zip(names, context.run_graph(model.graph, scope), strict=True))
-    chosen = _choose_output(context, values, n, output)
-    field, place = _choose_channel(context, chosen, values[chosen], n, channel)
+def _run(request: _Request, n: int) -> _Run:
+    context = Context(Store(request.n_inputs), opset_versions(request.model), LOWERINGS, REFUSALS)
+    graph = request.model.graph
+    scope: Scope = {
+        entry.name: _input_value(entry, n, request.first_parameter.get(entry.name)) for entry in request.layout.inputs
+    }
+    names = [value.name for value in graph.output]
+    values = dict(zip(names, context.run_graph(graph, scope), strict=True))
+    chosen = choose_output(context, values, n, request.output)
+    field, place = choose_channel(context, chosen, values[chosen], n, request.channel)
     field = context.algebra.settle(field)
     if problems := context.problems_of(field):
         raise ModelRefused([context.problems[number] for number in sorted(problems)])
@@ -158,115 +220,30 @@ def _run(model: onnx.ModelProto, layout: Layout, n: int, output: str | None, cha
     return _Run(context, place, field)
 
 
-def _input_value(entry: PointInput | BoundInput, n: int) -> Constant | Tensor:
+def _input_value(entry: PointInput | BoundInput, n: int, first_parameter: int | None) -> Constant | Tensor:
+    """The input for ``n`` points; its bound elements are numbers, or the inputs from ``first_parameter`` on."""
     if isinstance(entry, BoundInput):
         shape = tuple(n if size is None else size for size in entry.shape)
         check_size(shape)
-        return Constant.of(np.array(np.broadcast_to(entry.value, shape)), entry.dtype)
-    width = len(entry.columns)
-    coordinate = np.broadcast_to(np.array(entry.columns), (n, width))
-    live = coordinate >= 0
-    tensor = Tensor(
-        np.where(live, np.arange(n, dtype=np.int32)[:, None], np.int32(NO_POINT)),
-        np.where(live, coordinate, CONSTANT),
-        np.zeros((n, width), np.int32),
-        live.astype(np.float64),
-        np.where(live, 0.0, entry.values),
-        entry.dtype,
-    )
+        if first_parameter is None:
+            return Constant.of(np.array(np.broadcast_to(entry.value, shape)), entry.dtype)
+        number = first_parameter + np.arange(entry.value.size).reshape(entry.value.shape)
+        return _coordinates(np.array(np.broadcast_to(number, shape)), np.full(shape, NO_POINT), entry.dtype)
+    columns, live = np.array(entry.columns), np.array(entry.columns) >= 0
+    if first_parameter is not None:
+        columns[~live] = first_parameter + np.arange(np.count_nonzero(~live))
+    shape = (n, len(columns))
+    point = np.where(live, np.arange(n)[:, None], NO_POINT)
+    tensor = _coordinates(np.array(np.broadcast_to(columns, shape)), point, entry.dtype)
+    if first_parameter is None:
+        tensor.scale[:, ~live], tensor.offset[:, ~live] = 0.0, entry.values[~live]
     return tensor.map(entry.arrange)
 
 
-def _problem(name: str, reason: str, remedy: str) -> Problem:
-    return Problem(f"output {name!r}" if name else "", "", 0, reason, remedy)
-
-
-def _choose_output(context: Context, values: Mapping[str, GraphValue], n: int, output: str | None) -> str:
-    """The output by name, or the only one that gives one real number per point."""
-    if output is not None:
-        if output not in values:
-            raise UsageError(f"there is no output {output!r}; the outputs are: {', '.join(map(repr, values))}")
-        return output
-    if len(values) == 1:
-        return next(iter(values))
-    usable = {
-        name: value
-        for name, value in values.items()
-        if isinstance(value, (Constant, Tensor)) and is_float(value.dtype) and not context.problems_of(value)
-    }
-    single = [name for name, value in usable.items() if math.prod(value.shape) == n and isinstance(value, Tensor)]
-    if len(single) == 1:
-        return single[0]
-    candidates = single or list(usable)
-    if len(candidates) == 1:
-        return candidates[0]
-    if not candidates:
-        problems = sorted(frozenset().union(*(context.problems_of(value) for value in values.values())))
-        if problems:
-            raise ModelRefused([context.problems[number] for number in problems])
-    shown = ", ".join(repr(name) for name in candidates or values)
-    raise ModelRefused(
-        [
-            _problem(
-                "",
-                f"several outputs could be the field: {shown}",
-                f"choose one: --output {(candidates or list(values))[0]}",
-            )
-        ]
-    )
-
-
-def _choose_channel(
-    context: Context, name: str, value: GraphValue, n: int, channel: int | None
-) -> tuple[Tensor, Output]:
-    """The field [n] of an output, and where it is."""
-    if isinstance(value, Opaque):
-        raise ModelRefused([context.problems[number] for number in sorted(value.problems)])
-    if not isinstance(value, (Constant, Tensor)):
-        raise ModelRefused([_problem(name, "it is a sequence of tensors", "export the field as a tensor")])
-    tensor = lift(value)
-    if tensor.dtype.kind in "biu":
-        raise ModelRefused(
-            [_problem(name, f"it has type {tensor.dtype.name}", "choose the output with the real-valued field")]
-        )
-    axis = _point_axis(tensor, n)
-    if axis is None and (n > 1 or tensor.size == 0):
-        if problems := context.problems_of(tensor):
-            raise ModelRefused([context.problems[number] for number in sorted(problems)])
-        raise ModelRefused([_shape_problem(name, tensor, n)])
-    rows = tensor.reshape(1, -1) if axis is None else tensor.map(lambda f: np.moveaxis(f, axis, 0))
-    rows = rows.reshape(n, tensor.size // n)
-    width = rows.shape[1]
-    if channel is None and width > 1:
-        if problems := context.problems_of(tensor):
-            raise ModelRefused([context.problems[number] for number in sorted(problems)])
-        raise ModelRefused(
-            [_problem(name, f"it has {width} channels", f"choose one, from 0 to {width - 1}: --output {name}:0")]
-        )
-    chosen = channel or 0
-    if not -width <= chosen < width:
-        raise UsageError(f"output {name!r} has {width} channels; there is no channel {channel}")
-    return rows[:, chosen], Output(name, axis, chosen % width)
-
-
-def _point_axis(tensor: Tensor, n: int) -> int | None:
-    """The axis along which the points lie in order."""
-    for axis, size in enumerate(tensor.shape):
-        if size == n:
-            rows = np.moveaxis(tensor.point, axis, 0).reshape(n, -1)
-            live = np.moveaxis(tensor.live, axis, 0).reshape(n, -1)
-            if (~live | (rows == np.arange(n)[:, None])).all():
-                return axis
-    return None
-
-
-def _shape_problem(name: str, tensor: Tensor, n: int) -> Problem:
-    live = tensor.live
-    if live.any() and len(np.unique(tensor.point[live])) < n:
-        reason = f"its shape {list(tensor.shape)} for {n} points does not give every point values of its own"
-        return _problem(name, reason, "export a network that maps every point on its own")
-    return _problem(name, f"its shape {list(tensor.shape)} for {n} points has no axis of the points in order",
-                    "export the field with shape [N] or [N, channels]")  # fmt: skip
+def _coordinates(number: Integers, point: Integers, dtype: np.dtype) -> Tensor:
+    """The inputs of the network by number; elements of number `CONSTANT` are numbers."""
+    shape = number.shape
+    return Tensor(point.astype(np.int32), number, np.zeros(shape, np.int32), np.ones(shape), np.zeros(shape), dtype)
 
 
 def _place_problem(context: Context, name: str) -> Problem:
@@ -283,7 +260,7 @@ def _batch_problem(first: Context, second: Context) -> Problem:
     for a, b in zip(first.traces, second.traces, strict=True):
         if a.first != b.first or not first.store.agrees(second.store, a.size):
             return first.node_problem(a.label, reason, remedy)
-    return _problem("", reason, remedy)
+    return output_problem("", reason, remedy)
 
 
 def _network(run: _Run, dim: int) -> Network:

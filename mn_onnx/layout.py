@@ -54,6 +54,13 @@ class BoundInput:
         return np.array(np.broadcast_to(self.value, shape), self.dtype)
 
 
+def parameter_values(entry: PointInput | BoundInput) -> Floats:
+    """The numbers that an input is bound to, in order: all of a bound input, the bound columns of the points."""
+    if isinstance(entry, BoundInput):
+        return np.asarray(entry.value, np.float64).reshape(-1)
+    return entry.values[[column for column, coordinate in enumerate(entry.columns) if coordinate < 0]]
+
+
 @dataclass(frozen=True)
 class Output:
     """Where the field is: ``axis`` counts the points (None for a model of one point), ``channel`` those of a point."""

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mn_onnx.errors import ModelRefused, Problem, UsageError
-from mn_onnx.importer import Imported, import_network
+from mn_onnx.importer import Imported, ImportOptions, import_network
 from mn_onnx.ir.bounds import output_bounds
 from mn_onnx.ir.evaluate import evaluate
 from mn_onnx.ir.network import Network
@@ -123,6 +123,14 @@ def load(source: ModelSource | ReadModel, **options: Unpack[LoadOptions]) -> Mod
     or holds what cannot be extracted.
     """
     started = time.perf_counter()
+    check_options(options)
+    read = source if isinstance(source, ReadModel) else read_model(source)
+    imported = import_network(read.model, **import_options(read, options))
+    return canonical_model(read, imported, options, seconds=time.perf_counter() - started)
+
+
+def check_options(options: LoadOptions) -> None:
+    """Raise `UsageError` for numbers that make no sense."""
     level, knots, tolerance = options.get("level", 0.0), options.get("knots_per_period"), options.get("surrogate_tol")
     if not np.isfinite(level):
         raise UsageError(f"the level {level} is not a finite number")
@@ -133,22 +141,29 @@ def load(source: ModelSource | ReadModel, **options: Unpack[LoadOptions]) -> Mod
     budget = options.get("budget")
     if budget is not None and not budget >= 1:
         raise UsageError(f"budget must be at least 1 polygon, not {budget}")
-    read = source if isinstance(source, ReadModel) else read_model(source)
+
+
+def import_options(read: ReadModel, options: LoadOptions) -> ImportOptions:
+    """What the importer must know of ``options``."""
     output, channel = output_and_channel(options.get("output"), [value.name for value in read.model.graph.output])
-    imported = import_network(
-        read.model,
-        output=output,
-        channel=channel,
-        bind=options.get("bind"),
-        coordinates=options.get("coordinates"),
-    )
+    return {
+        "output": output,
+        "channel": channel,
+        "bind": options.get("bind"),
+        "coordinates": options.get("coordinates"),
+    }
+
+
+def canonical_model(read: ReadModel, imported: Imported, options: LoadOptions, *, seconds: float) -> Model:
+    """The model of ``imported``, in canonical form; ``seconds``: what importing took. Raises as `load`."""
+    started = time.perf_counter()
+    level, tolerance = options.get("level", 0.0), options.get("surrogate_tol")
     bounds, bounds_from = options.get("bounds"), "option"
     if bounds is None:
         bounds, bounds_from = bounds_from_metadata(imported.metadata), "metadata"
     if bounds is None:
         bounds, bounds_from = DEFAULT_BOUNDS, "default"
     lower, upper = box(bounds, imported.input_dim)
-    read_in = time.perf_counter()
     try:
         canonical, fineness = canonical_within_budget(
             imported.network,
@@ -156,8 +171,8 @@ def load(source: ModelSource | ReadModel, **options: Unpack[LoadOptions]) -> Mod
             upper=upper,
             level=level,
             surrogate_tol=tolerance,
-            knots_per_period=knots,
-            budget=budget,
+            knots_per_period=options.get("knots_per_period"),
+            budget=options.get("budget"),
         )
     except PassFailed as error:
         remedy = "choose smaller --bounds, or export the network with activations that are defined everywhere"
@@ -165,8 +180,8 @@ def load(source: ModelSource | ReadModel, **options: Unpack[LoadOptions]) -> Mod
     except ToleranceNotReached as error:
         raise UsageError(f"--surrogate-tol {tolerance:g} cannot be certified: {error}") from error
     sign = resolve_sign(canonical, options.get("sign"))
-    seconds = {"import": read_in - started, "lower": time.perf_counter() - read_in}
-    model = Model(read, imported, oriented(canonical, sign), level, lower, upper, seconds, sign, bounds_from, fineness)
+    phases = {"import": seconds, "lower": time.perf_counter() - started}
+    model = Model(read, imported, oriented(canonical, sign), level, lower, upper, phases, sign, bounds_from, fineness)
     if not canonical.empty_reason and model.output_range == (0.0, 0.0):
         reason = f"the output is {level:g}, the level, everywhere in the box: there is no surface"
         raise ModelRefused([Problem("", "", 0, reason, "check the weights, or choose another --level or --output")])

@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Mapping
+from functools import cached_property
 from pathlib import Path
+from typing import Unpack
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mn_onnx.errors import UsageError
+from mn_onnx.errors import ModelRefused, UsageError
+from mn_onnx.importer import Family, import_family
+from mn_onnx.model import LoadOptions, Model, canonical_model, check_options, import_options, load
+from mn_onnx.reader import ModelSource, ReadModel, read_model
 
 Floats = NDArray[np.float64]
 
@@ -32,6 +38,44 @@ def row_of(bound: Mapping[str, Floats], row: int) -> dict[str, Floats]:
     if not 0 <= row < n_rows:
         raise UsageError(f"there is no row {row}: the tables have rows 0 to {n_rows - 1}")
     return {name: value[row] if value.ndim >= 2 else value for name, value in bound.items()}
+
+
+class Series:
+    """The models of all rows of the tables in ``options["bind"]``.
+
+    ``source``: as of `mn_onnx.model.load`. The graph is lowered once, with the codes as parameters; where codes are
+    multiplied with the point (FiLM layers, hypernetworks) it is piecewise linear for each code alone, and is lowered
+    for each.
+
+    Raises `UsageError` for tables that do not fit each other, and as `load` for a model that cannot be read.
+    """
+
+    def __init__(self, source: ModelSource | ReadModel, **options: Unpack[LoadOptions]) -> None:
+        check_options(options)
+        self._bound = {name: np.asarray(value, np.float64) for name, value in (options.get("bind") or {}).items()}
+        self.n_rows = count_rows(self._bound)
+        self._options = options
+        self._read = source if isinstance(source, ReadModel) else read_model(source)
+
+    @cached_property
+    def _family(self) -> Family | None:
+        tables = [name for name, value in self._bound.items() if value.ndim >= 2]
+        try:
+            return import_family(self._read.model, tables, **import_options(self._read, self._options_of(0)))
+        except ModelRefused:
+            return None
+
+    def _options_of(self, row: int) -> LoadOptions:
+        return {**self._options, "bind": row_of(self._bound, row)}
+
+    def model(self, row: int) -> Model:
+        """The model of one row. Raises as `load`."""
+        started = time.perf_counter()
+        options = self._options_of(row)
+        if self._family is None:
+            return load(self._read, **options)
+        imported = self._family.member(row_of(self._bound, row))
+        return canonical_model(self._read, imported, options, seconds=time.perf_counter() - started)
 
 
 def numbered(path: str, row: int, n_rows: int) -> str:

@@ -3,6 +3,7 @@
 An element is ``scale * function(t) + offset``, where ``t`` is a *base*: an affine row over the variables of one point
 (its coordinates, then unit outputs). Bases and functions are numbers of entries in a `mn_onnx.symbolic.store.Store`.
 Elements of different points that compute the same function hold the same entries and differ in ``point`` alone.
+Coordinates may be parameters, the same for all points: elements of parameters alone depend on no point.
 """
 
 from __future__ import annotations
@@ -70,9 +71,9 @@ class Opaque:
 class Tensor:
     """A tensor of elements; the five arrays have its shape.
 
-    ``point`` int32: the point an element depends on, `NO_POINT` for numbers; ``base`` int64; ``function`` int32;
-    ``scale``, ``offset`` float64. ``dtype`` is the type in the graph; elements of boolean tensors have truth-valued
-    functions with scale 1 and offset 0.
+    ``point`` int32: the point an element depends on, `NO_POINT` for numbers and functions of parameters alone;
+    ``base`` int64; ``function`` int32; ``scale``, ``offset`` float64. ``dtype`` is the type in the graph; elements of
+    boolean tensors have truth-valued functions with scale 1 and offset 0.
     """
 
     point: NDArray[np.int32]
@@ -92,7 +93,7 @@ class Tensor:
 
     @property
     def live(self) -> NDArray[np.bool_]:
-        """Where the element depends on its point."""
+        """Where the element is no number: it depends on its point or on parameters."""
         return self.base >= 0
 
     @property

@@ -173,8 +173,9 @@ class Composer:
         point = np.full(n, NO_POINT, np.int32)
         mixed = np.zeros(n, np.bool_)
         for operand in operands:
-            mixed |= (point != NO_POINT) & operand.live & (operand.point != point)
-            point = np.where(operand.live, operand.point, point)
+            of_a_point = operand.live & (operand.point != NO_POINT)
+            mixed |= (point != NO_POINT) & of_a_point & (operand.point != point)
+            point = np.where(of_a_point, operand.point, point)
         keys: list[Array] = [mixed]
         for operand in operands:
             keys += [operand.base, operand.function, operand.scale, operand.offset]

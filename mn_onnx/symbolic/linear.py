@@ -21,12 +21,13 @@ def contract(algebra: Algebra, x: Tensor, weights: Floats, bias: Floats | None =
     r, j = x.shape[0], weights.shape[1]
     check_size((r, j))
     x = algebra.settle(x)
-    live = x.live
+    of_a_point = x.live & (x.point != NO_POINT)
     fields = [np.zeros((r, j), dtype) for dtype in (np.int32, np.int64, np.int32, np.float64, np.float64)]
     point, base, function, scale, offset = fields
-    if x.size and live.any():
-        lowest = np.where(live, x.point, np.iinfo(np.int32).max).min(axis=1)
-        lone = lowest == np.where(live, x.point, NO_POINT).max(axis=1)
+    if of_a_point.any():
+        highest = np.where(of_a_point, x.point, NO_POINT).max(axis=1)
+        lowest = np.where(of_a_point, x.point, highest[:, None]).min(axis=1)
+        lone = lowest == highest
     else:
         lowest, lone = np.full(r, NO_POINT), np.ones(r, np.bool_)
     for members in _alike(x, lone):
@@ -36,7 +37,7 @@ def contract(algebra: Algebra, x: Tensor, weights: Floats, bias: Floats | None =
         if lone[first]:
             point[members] = lowest[members, None]
         else:
-            touched = (weights != 0.0) & row.live[:, None]
+            touched = (weights != 0.0) & of_a_point[first][:, None]
             for column in range(j):
                 points = np.unique(row.point[touched[:, column]])
                 point[members, column] = points[0] if points.size else NO_POINT
