@@ -90,3 +90,14 @@ def test_a_wrong_limit_is_wrong_usage(tmp_path: Path, capsys: pytest.CaptureFixt
     assert "'much'" in capsys.readouterr().err
     with pytest.raises(UsageError, match="positive"):
         mn_onnx.extract(octahedron_model(), max_memory=0)
+
+
+def test_an_allocation_that_fails_is_told_without_a_traceback(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def exhausted(*arguments: object, **options: object) -> None:
+        raise MemoryError("Unable to allocate 1.00 TiB")
+
+    monkeypatch.setattr("mn_onnx.commands.load", exhausted)
+    assert main(["inspect", str(BUNNY)]) == EXIT_MEMORY
+    assert "Unable to allocate 1.00 TiB\n  Fix: " in capsys.readouterr().err
