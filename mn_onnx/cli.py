@@ -32,9 +32,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         _complain(str(error))
         return EXIT_MEMORY
     except MemoryError as error:
-        _complain(
-            f"there is no memory left: {error or 'an allocation failed'}\n  Fix: extract the box in parts with --bounds"
-        )
+        reason = str(error) or "an allocation failed"
+        _complain(f"there is no memory left: {reason}\n  Fix: extract the box in parts with --bounds")
         return EXIT_MEMORY
     except MnOnnxError as error:
         _complain(str(error))
