@@ -16,7 +16,7 @@ def ensure_place_for_kernels(package: Path, user_cache: Path) -> Path | None:
     numba keeps compiled kernels beside their source in ``package``, else below ``user_cache``, else it raises, as for
     a service that runs an installation of another user and has no home.
     """
-    if os.environ.get(VARIABLE) or _takes_files(package) or _takes_files(user_cache):
+    if os.environ.get(VARIABLE) or _takes_files(package / "__pycache__") or _takes_files(user_cache):
         return None
     folder = _private_folder()
     os.environ[VARIABLE] = str(folder)
@@ -26,12 +26,14 @@ def ensure_place_for_kernels(package: Path, user_cache: Path) -> Path | None:
 
 
 def user_cache() -> Path:
-    """The folder in which programs keep what they can make again, as numba chooses it."""
+    """The folder below the user's home in which numba keeps what finds no place beside its source."""
     if sys.platform == "win32":
-        return Path(os.environ.get("LOCALAPPDATA") or os.path.expanduser("~"))
-    if sys.platform == "darwin":
-        return Path(os.path.expanduser("~/Library/Caches"))
-    return Path(os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache"))
+        base = os.environ.get("LOCALAPPDATA") or os.path.expanduser("~")
+    elif sys.platform == "darwin":
+        base = os.path.expanduser("~/Library/Caches")
+    else:
+        base = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
+    return Path(base) / "numba"
 
 
 def _takes_files(folder: Path) -> bool:
