@@ -11,6 +11,7 @@ from mn_onnx.errors import Problem
 from mn_onnx.ir.network import Network
 from mn_onnx.model import Model
 from mn_onnx.report import model_entries
+from mn_onnx.summaries import box_text
 
 
 def describe(model: Model) -> dict[str, Any]:
@@ -82,13 +83,14 @@ def as_text(description: dict[str, Any]) -> str:
     if description["forecast_polygons"] is not None:
         knots = description["knots_per_period"]
         fineness = "" if knots is None else f" at {knots:.3g} knots per period"
-        lines.append(f"  expected     about {description['forecast_polygons']:,} polygons{fineness}")
+        pieces = {1: "roots", 2: "segments", 3: "polygons"}[description["dimension"]]
+        lines.append(f"  expected     about {description['forecast_polygons']:,} {pieces}{fineness}")
     for stage in ("imported", "canonical"):
         sizes = description[stage]
         layers = " + ".join(str(units) for units in sizes["layers"]) or "none"
         knots = "" if sizes["knots"] is None else f", {sizes['knots']:,} knots"
         lines.append(f"  {stage:<12} {sizes['units']:,} units ({layers}){knots}, {sizes['weights']:,} weights")
-    lines.append(f"  box          {' x '.join(f'[{a:g}, {b:g}]' for a, b in description['bounds'])}")
+    lines.append(f"  box          {box_text(description)}")
     verdict = "; certainly no level set in the box" if description["empty"] else ""
     lines.append(f"  level        {description['level']:g}: f is certified within {low:.6g} .. {high:.6g}{verdict}")
     return "\n".join(lines)

@@ -175,7 +175,10 @@ def canonical_model(read: ReadModel, imported: Imported, options: LoadOptions, *
             budget=options.get("budget"),
         )
     except PassFailed as error:
-        remedy = "choose smaller --bounds, or export the network with activations that are defined everywhere"
+        remedy = (
+            "choose smaller --bounds, or export the network with activations that are defined everywhere (a quotient "
+            "such as sin(t)/t as sin(s)/s with s = sqrt(t*t + 1e-8))"
+        )
         raise ModelRefused([Problem("", "", 0, str(error), remedy)]) from error
     except ToleranceNotReached as error:
         raise UsageError(f"--surrogate-tol {tolerance:g} cannot be certified: {error}") from error

@@ -5,12 +5,21 @@ from __future__ import annotations
 from typing import Any
 
 
+def box_text(report: dict[str, Any]) -> str:
+    """The box of a report, and where it is from."""
+    source = {"option": "as asked for", "metadata": "from the model's metadata", "default": "by default"}
+    sides = " x ".join(f"[{low:g}, {high:g}]" for low, high in report["bounds"])
+    return f"{sides}, {source[report['bounds_from']]}"
+
+
 def mesh_summary(mesh: str, report: dict[str, Any]) -> str:
     """A few lines about the mesh in the file ``mesh``, from the entries of `mn_onnx.report`."""
     lines = [
         f"{mesh}: {report['polygons']:,} polygons, {report['vertices']:,} vertices, {report['components']} components, "
         f"Euler number {report['euler']}, {_closure(report)}"
     ]
+    if "bounds" in report:
+        lines.append(f"  box: {box_text(report)}")
     if report["max_abs_f"] is not None:
         lines.append(f"  |f| on the mesh: max {report['max_abs_f']:.2g}, mean {report['mean_abs_f']:.2g}")
     if not report["exact"]:
@@ -44,7 +53,7 @@ def planar_summary(path: str, report: dict[str, Any]) -> str:
             f"{report['polylines']:,} polylines of {report['segments']:,} segments, length {report['length']:.6g}, "
             f"{closure}"
         )
-    lines = [f"{path}: {what}; max |f| {report['max_abs_f']:.2g}"]
+    lines = [f"{path}: {what}; max |f| {report['max_abs_f']:.2g}", f"  box: {box_text(report)}"]
     if not report["exact"]:
         lines.append(f"  surrogates within {report['surrogate_eps']:.2g} of the true network")
     return "\n".join(lines)
