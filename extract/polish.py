@@ -1,41 +1,47 @@
-"""Moves the vertices of a surface onto the level set of the true network, and keeps its topology.
+"""Moves a surface onto the level set of the true network: keeps the topology, turns no face over.
 
-Every vertex moves along one line: the mean gradient of the faces around it, which turns less from vertex to vertex than
-the gradient at each of them, so that neighbours stay in order. On that line the root of ``f_true`` is found by secant
-steps, Newton's with the slope measured rather than derived (Dahlquist and Bjorck, Numerical Methods, section 6.4).
-Vertices on the box stay on the faces of the box that hold them. Where a face would turn over, its vertices go back.
+Vertices follow the gradient of the true network (`mn_onnx.extract.projection`). Faces that this turns over are turned
+back by sliding vertices along the level set (`mn_onnx.extract.unfold`), else by going back the way they came. Then
+faces whose middle is too far from the level set, which is curved, are divided (`mn_onnx.extract.subdivide`).
+
+Where the gradients of the surrogate and of the true network are less than 90 degrees apart throughout, every mixture of
+both has a gradient there, none of its level sets has a critical point, and both surfaces have the same topology
+(Milnor, Morse Theory, theorem 3.1). Faces where that fails are counted.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mn_onnx.extract.blocks import resolve_threads, run_blocks
+from mn_onnx.extract.blocks import resolve_threads
 from mn_onnx.extract.measures import measure_polygons
+from mn_onnx.extract.projection import Projection, TrueField
+from mn_onnx.extract.subdivide import subdivide
 from mn_onnx.extract.surface import Surface
-from mn_onnx.ir.evaluate import evaluate
+from mn_onnx.extract.unfold import Neighbours, mean_over_corners, unfold
 from mn_onnx.ir.network import Network
 
 Floats = NDArray[np.float64]
-
-STEPS = 8
-CONVERGED = 1e-12
-"""|f| relative to the slope times the box: nothing is gained beyond."""
-
-REACH = 2.0
-"""A vertex moves at most this many times the displacement that the error bounds of its faces allow."""
-
-NEWTON_REACH = 3.0
-"""Nor farther than this many Newton steps: beyond, the mean slope tells nothing of where the level set is."""
+Integers = NDArray[np.int64]
 
 RETREATS = 12
-"""Vertices of faces that would turn over go half the way back this often, then all the way."""
+"""Vertices of faces that stay turned over go half the way back this often, then all the way."""
 
-BLOCK = 1 << 14
+FLATNESS = 1e-6
+"""Faces are divided until their mean |f| is this part of the typical slope times half of the box."""
+
+DIVISIONS = 8
+"""Rounds of dividing faces; each makes |f| on them about four times smaller."""
+
+MOST_GROWTH = 4.0
+SMALL = 1 << 16
+"""Dividing faces makes at most this many times as many polygons, or this many in all for a small mesh."""
+
+MARGIN = 0.85
+"""Faces are chosen so that their mean |f| is foretold to be this part of what is wanted."""
 
 
 @dataclass(frozen=True)
@@ -43,171 +49,176 @@ class Polish:
     """What polishing did. ``f`` is the canonical value of the true network, zero on its level set.
 
     ``max_abs_f_before``, ``mean_abs_f_before``, ``max_abs_f``, ``mean_abs_f``: |f| over the vertices, before and after.
-    ``largest_move``: the farthest a vertex went. ``held_vertices``: those left short of the level set so that no face
-    turns over. ``stray_vertices``: those that found no root within their reach.
+    ``vertices_within_1e_6``, ``vertices_within_1e_9``: how many have |f| of at most that after it.
+    ``largest_move``: the farthest a vertex of the surface went. ``slid_vertices``: those moved along the level set to
+    turn a face back. ``held_vertices``: those left short of the level set so that no face turns over.
+    ``stray_vertices``: others that found no root within their reach. ``turned_polygons``, ``turned_area_share``: before
+    it, the polygons whose gradient is more than 90 degrees from the true one; near these the topology need not be that
+    of the true level set. ``reversed_polygons``: those among them that face against the true gradient afterwards.
+    ``divided_polygons``: how many were divided to come closer to the curved level set.
     """
 
     max_abs_f_before: float
     mean_abs_f_before: float
     max_abs_f: float
     mean_abs_f: float
+    vertices_within_1e_6: int
+    vertices_within_1e_9: int
     largest_move: float
+    slid_vertices: int
     held_vertices: int
     stray_vertices: int
+    turned_polygons: int
+    turned_area_share: float
+    reversed_polygons: int
+    divided_polygons: int
 
 
 def polish(
-    surface: Surface, network: Network, lower: Floats, upper: Floats, *, threads: int | None = None
+    surface: Surface,
+    network: Network,
+    lower: Floats,
+    upper: Floats,
+    *,
+    threads: int | None = None,
+    flatness: float = FLATNESS,
 ) -> tuple[Surface, Polish]:
     """The surface with its vertices on the level set of the true functions of ``network``, and what was done.
 
-    ``surface``: the level set of canonical ``network`` in the box ``lower``..``upper`` (float64 [3]), with ``errors``
-    set. Connectivity and order stay. The gradients of the result are normal to its polygons, as long as before; its
-    ``errors`` are still those of the surface before.
+    ``surface``: the level set of canonical ``network`` in the box ``lower``..``upper`` (float64 [3]). ``flatness``:
+    faces are divided until their mean |f| is this part of the typical slope times half of the box (infinite: none
+    is). The polygons of the result need not be flat; their gradients are those of the true network, the means of their
+    corners'; ``errors`` and attributes are those of the polygons they come from.
     """
     threads = resolve_threads(threads)
     lower, upper = np.asarray(lower, np.float64), np.asarray(upper, np.float64)
-
-    def f(points: Floats) -> Floats:
-        return _parallel(lambda part: evaluate(network, part, true_functions=True), points, threads)
-
-    directions, slopes = _directions(surface)
-    reach = REACH * _largest_around(surface, _displacements(surface))
-    before = f(surface.vertices)
-    reach = np.minimum(reach, NEWTON_REACH * np.abs(before) / np.where(slopes > 0, slopes, 1.0))
-    lengths, after = _roots(f, surface.vertices, directions, before, slopes, reach, lower, upper)
-    found = np.abs(after) < np.abs(before)
-    moved = np.where(found[:, None], np.clip(surface.vertices + lengths[:, None] * directions, lower, upper),
-                     surface.vertices)  # fmt: skip
-    settled = np.abs(after) <= 1e-9 * slopes * float((upper - lower).max())
-    shares = _shares_without_flips(surface, moved, threads)
-    held = shares < 1.0
-    vertices = np.where(held[:, None], surface.vertices + shares[:, None] * (moved - surface.vertices), moved)
-    after = np.where(found, after, before)
-    after[held] = f(vertices[held])
-    result = Polish(
-        max_abs_f_before=float(np.abs(before).max()),
-        mean_abs_f_before=float(np.abs(before).mean()),
-        max_abs_f=float(np.abs(after).max()),
-        mean_abs_f=float(np.abs(after).mean()),
-        largest_move=float(np.sqrt(((vertices - surface.vertices) ** 2).sum(axis=1)).max()),
-        held_vertices=int(np.count_nonzero(held)),
-        stray_vertices=int(np.count_nonzero(~settled & ~held)),
+    projection = Projection.of(surface, TrueField(network, threads), lower, upper)
+    before = np.abs(projection.values)
+    upright = _facing(surface, projection, surface.vertices, threads) > 0
+    projection.project(np.arange(surface.n_vertices))
+    slid, held = _turn_back(surface, projection, upright, threads)
+    stray = ~projection.settled()
+    stray[held] = False
+    moves = projection.positions - surface.vertices
+    largest_move = float(np.sqrt((moves**2).sum(axis=1)).max())
+    del moves
+    moved = replace(surface, vertices=projection.positions.copy())
+    wanted = flatness * projection.slope * 0.5 * float((upper - lower).max())
+    result, divided, held_new = _divide(moved, projection, wanted, threads)
+    result, reversed_polygons = _with_gradients(result, projection, threads)
+    after = np.abs(projection.values)
+    areas = surface.measures.areas
+    return result, Polish(
+        max_abs_f_before=float(before.max()),
+        mean_abs_f_before=float(before.mean()),
+        max_abs_f=float(after.max()),
+        mean_abs_f=float(after.mean()),
+        vertices_within_1e_6=int(np.count_nonzero(after <= 1e-6)),
+        vertices_within_1e_9=int(np.count_nonzero(after <= 1e-9)),
+        largest_move=largest_move,
+        slid_vertices=int(slid.size),
+        held_vertices=int(held.size) + held_new,
+        stray_vertices=int(np.count_nonzero(stray)),
+        turned_polygons=int(np.count_nonzero(~upright)),
+        turned_area_share=float(areas[~upright].sum() / max(areas.sum(), np.finfo(np.float64).tiny)),
+        reversed_polygons=reversed_polygons,
+        divided_polygons=divided,
     )
-    measures = measure_polygons(vertices, surface.offsets, surface.corners, threads)
-    lengths_of = np.sqrt((measures.area_vectors**2).sum(axis=1))
-    steepness = np.sqrt((surface.gradients**2).sum(axis=1))
-    with np.errstate(invalid="ignore", divide="ignore"):
-        gradients = np.where(
-            lengths_of[:, None] > 0,
-            measures.area_vectors * (steepness / lengths_of)[:, None],
-            surface.gradients,
-        )
-    return replace(surface, vertices=vertices, gradients=gradients), result
 
 
-def _parallel(work: Callable[[Floats], Floats], points: Floats, threads: int) -> Floats:
-    result = np.empty(len(points))
+def _turn_back(
+    surface: Surface, projection: Projection, upright: NDArray[np.bool_], threads: int
+) -> tuple[Integers, Integers]:
+    """Turn back the faces that the projection turned over; returns the vertices that slid, and those held back.
 
-    def run(first: int, last: int) -> None:
-        for block in range(first, last):
-            part = slice(block * BLOCK, (block + 1) * BLOCK)
-            result[part] = work(points[part])
-
-    run_blocks(run, -(-len(points) // BLOCK), threads)
-    return result
-
-
-def _displacements(surface: Surface) -> Floats:
-    """How far the level set may be from each polygon, to first order: error over slope, [p]."""
-    steepness = np.sqrt((surface.gradients**2).sum(axis=1))
-    return np.where(steepness > 0, surface.errors / np.where(steepness > 0, steepness, 1.0), 0.0)
-
-
-def _largest_around(surface: Surface, of_polygons: Floats) -> Floats:
-    largest = np.zeros(surface.n_vertices)
-    np.maximum.at(largest, surface.corners, np.repeat(of_polygons, surface.polygon_sizes))
-    return largest
-
-
-def _directions(surface: Surface) -> tuple[Floats, Floats]:
-    """The unit vectors [v, 3] that vertices move along, and the slope [v] of ``f`` along them.
-
-    The mean gradient around each vertex, without the components that would leave a face of the box.
+    ``surface``: with the vertices where they were before. ``upright``: bool [p], the polygons that faced along the true
+    gradient then; none of them stays turned over.
     """
-    totals = np.zeros((surface.n_vertices, 3))
-    of_corners = np.repeat(surface.gradients, surface.polygon_sizes, axis=0)
-    for axis in range(3):
-        totals[:, axis] = np.bincount(surface.corners, of_corners[:, axis], surface.n_vertices)
-    counts = np.bincount(surface.corners, minlength=surface.n_vertices)
-    means = totals / np.maximum(counts, 1)[:, None]
-    on_box = np.flatnonzero(surface.box_faces >= 0)
-    following = _next_corners(surface)
-    for vertices in (surface.corners[on_box], surface.corners[following[on_box]]):
-        means[vertices, surface.box_faces[on_box] // 2] = 0.0
-    slopes = np.sqrt((means**2).sum(axis=1))
-    return means / np.where(slopes > 0, slopes, 1.0)[:, None], slopes
+    nobody = np.zeros(0, np.int64)
+    folded = np.flatnonzero(_facing(surface, projection, projection.positions, threads) < 0)
+    if not folded.size:
+        return nobody, nobody
+    neighbours = Neighbours.of(surface, threads)
+    movable = np.asarray(projection.free.all(axis=1))
 
+    def project(vertices: Integers) -> None:
+        projection.evaluate(vertices)
+        projection.project(vertices)
 
-def _next_corners(surface: Surface) -> NDArray[np.int64]:
-    following = np.arange(1, surface.n_corners + 1)
-    following[surface.offsets[1:] - 1] = surface.offsets[:-1]
-    return following
-
-
-def _roots(
-    f: Callable[[Floats], Floats],
-    start: Floats,
-    directions: Floats,
-    at_start: Floats,
-    slopes: Floats,
-    reach: Floats,
-    lower: Floats,
-    upper: Floats,
-) -> tuple[Floats, Floats]:
-    """Lengths [v] along ``directions`` at which |f| is least of all that were tried, and f there [v].
-
-    A length is at most ``reach``, and leads to a point of the box.
-    """
-    best, at_best = np.zeros(len(start)), at_start.copy()
-    previous, at_previous = best.copy(), at_start.copy()
-    slope = slopes.copy()
-    scale = CONVERGED * slopes * float((upper - lower).max())
-    active = np.flatnonzero((np.abs(at_start) > scale) & (slopes > 0) & (reach > 0))
-    for _ in range(STEPS):
-        if not active.size:
-            break
-        step = np.clip(best[active] - at_best[active] / slope[active], -reach[active], reach[active])
-        value = f(np.clip(start[active] + step[:, None] * directions[active], lower, upper))
-        change = step - previous[active]
-        with np.errstate(invalid="ignore", divide="ignore"):
-            measured = (value - at_previous[active]) / change
-        # A slope far below the mean one would throw the vertex far away.
-        usable = np.isfinite(measured) & (measured > 0.1 * slopes[active])
-        slope[active] = np.where(usable, measured, np.maximum(slope[active], slopes[active]) * 2)
-        better = np.abs(value) < np.abs(at_best[active])
-        previous[active] = np.where(better, best[active], step)
-        at_previous[active] = np.where(better, at_best[active], value)
-        best[active[better]], at_best[active[better]] = step[better], value[better]
-        # After a step that fails the secant through both points, the best one and the failed one, is tried next.
-        active = active[(np.abs(at_best[active]) > scale[active]) & (better | (np.abs(change) > 0))]
-    return best, at_best
-
-
-def _shares_without_flips(surface: Surface, moved: Floats, threads: int) -> Floats:
-    """Which share of its way to ``moved`` each vertex goes, [v], so that no polygon turns over."""
-    before = measure_polygons(surface.vertices, surface.offsets, surface.corners, threads).area_vectors
+    folded, slid = unfold(neighbours, folded, projection.positions, projection.gradients, movable, project)
+    folded = folded[upright[folded]]
+    goals = projection.positions.copy()
     shares = np.ones(surface.n_vertices)
-    sizes = surface.polygon_sizes
-    retreat = 0
-    while True:
-        vertices = surface.vertices + shares[:, None] * (moved - surface.vertices)
-        after = measure_polygons(vertices, surface.offsets, surface.corners, threads).area_vectors
-        agreement = np.einsum("ij,ij->i", before, after)
-        flipped = (agreement < 0) & (np.einsum("ij,ij->i", before, before) > 0)
-        corners = surface.corners[np.repeat(flipped, sizes)]
-        corners = corners[shares[corners] > 0]
-        if not corners.size:
-            return shares
-        shares[np.unique(corners)] *= 0.5 if retreat < RETREATS else 0.0
-        retreat += 1
+    retreats = 0
+    while folded.size:
+        back = neighbours.vertices_of(folded)
+        back = back[shares[back] > 0]
+        if not back.size:
+            break
+        shares[back] *= 0.5 if retreats < RETREATS else 0.0
+        retreats += 1
+        start = surface.vertices[back]
+        projection.positions[back] = start + shares[back, None] * (goals[back] - start)
+        projection.evaluate(back)
+        touched = neighbours.polygons_at(back)
+        touched = touched[upright[touched]]
+        folded = touched[neighbours.facing(touched, projection.positions, projection.gradients) < 0]
+    return slid, np.flatnonzero(shares < 1.0)
+
+
+def _facing(surface: Surface, projection: Projection, positions: Floats, threads: int) -> Floats:
+    """The area times the slope along the normal of each polygon, [p], at ``positions``: negative if turned over."""
+    area_vectors = measure_polygons(positions, surface.offsets, surface.corners, threads).area_vectors
+    gradients = mean_over_corners(projection.gradients, surface.offsets, surface.corners)
+    return np.asarray(np.einsum("ij,ij->i", area_vectors, gradients))
+
+
+def _divide(surface: Surface, projection: Projection, wanted: float, threads: int) -> tuple[Surface, int, int]:
+    """Divide faces until the mean |f| at their middles is ``wanted``.
+
+    Takes those with the largest |f|: where it is equal on all faces, their number is least for its mean. Faces with a
+    vertex that is not on the level set are left alone: dividing them brings them no closer. Returns the surface, how
+    many faces were divided, and how many new vertices were held back.
+    """
+    most = max(MOST_GROWTH * surface.n_polygons, SMALL)
+    n_divided = n_held = 0
+    for _ in range(DIVISIONS):
+        middles = mean_over_corners(surface.vertices, surface.offsets, surface.corners)
+        settled = np.minimum.reduceat(projection.settled()[surface.corners], surface.offsets[:-1])
+        heights = np.where(settled, np.abs(projection.field.values(middles)), 0.0)
+        order, needed = _highest(heights, surface.measures.areas, wanted)
+        # A polygon of n corners becomes at most n.
+        room = np.searchsorted(np.cumsum(surface.polygon_sizes[order]), most - surface.n_polygons, side="right")
+        chosen = order[: min(needed, int(room))]
+        if not chosen.size:
+            break
+        n_known = surface.n_vertices
+        surface, free, numbers = subdivide(surface, chosen, projection.free, threads)
+        projection.insert(numbers, surface.vertices, free)
+        upright = _facing(surface, projection, surface.vertices, threads) > 0
+        projection.project(np.flatnonzero(numbers >= n_known))
+        _, held = _turn_back(surface, projection, upright, threads)
+        surface = replace(surface, vertices=projection.positions.copy())
+        n_divided += int(chosen.size)
+        n_held += int(held.size)
+    return surface, n_divided, n_held
+
+
+def _highest(heights: Floats, areas: Floats, wanted: float) -> tuple[Integers, int]:
+    """Polygons by falling |f|, and how many of them to divide so that its mean over the area becomes ``wanted``."""
+    order = np.argsort(-heights, kind="stable")
+    moments = (heights * areas)[order]
+    excess = moments.sum() - MARGIN * wanted * areas.sum()
+    if excess <= 0 or moments.sum() <= wanted * areas.sum():
+        return order, 0
+    # Dividing a face makes it half as wide, and its height a quarter.
+    return order, int(np.searchsorted(0.75 * np.cumsum(moments), excess)) + 1
+
+
+def _with_gradients(surface: Surface, projection: Projection, threads: int) -> tuple[Surface, int]:
+    """The surface with the true gradients of its polygons, and the number of those that face against theirs."""
+    gradients = mean_over_corners(projection.gradients, surface.offsets, surface.corners)
+    area_vectors = measure_polygons(surface.vertices, surface.offsets, surface.corners, threads).area_vectors
+    against = np.einsum("ij,ij->i", area_vectors, gradients) < 0
+    gradients[against] *= -1
+    return replace(surface, gradients=gradients), int(np.count_nonzero(against))

@@ -16,7 +16,7 @@ from mn_onnx.ir.ranges import RangeMaximum
 from mn_onnx.ir.scalar.derivative import derivative
 
 # Values of all variables of one chunk of points; small enough for the caches of a core.
-CHUNK_BYTES = 1 << 21
+CHUNK_BYTES = 1 << 20
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,6 +45,8 @@ class Hinges:
 
     def slopes(self, t: Floats) -> Floats:
         """Slopes [n, h] at pre-activations [n, h]."""
+        if self._are_rectifiers:
+            return (t >= 0.0).astype(np.float64)
         return np.where(t >= self.knots, self.right[0], self.left[0])
 
     def slopes_between(self, lower: Floats, upper: Floats) -> tuple[Floats, Floats]:
@@ -189,12 +191,18 @@ class Evaluator:
 
     def gradients(self, points: Floats) -> Floats:
         """The gradient of ``f`` at ``points`` (float64 [n, input_dim]), float64 [n, input_dim]."""
+        return self.values_and_gradients(points)[1]
+
+    def values_and_gradients(self, points: Floats) -> tuple[Floats, Floats]:
+        """`values` and `gradients` at ``points`` (float64 [n, input_dim]) in one pass."""
         points = validated_points(self.network, points)
-        result = np.empty_like(points)
+        output = self.network.output
+        values, gradients = np.empty(points.shape[0]), np.empty_like(points)
         for chunk in self.chunks(points):
-            _, pre_activations = self.forward(points[chunk])
-            result[chunk] = self._backward(pre_activations, result[chunk].shape[0])
-        return result
+            variables, pre_activations = self.forward(points[chunk])
+            values[chunk] = variables[:, contiguous(output.columns)] @ output.weights + output.bias
+            gradients[chunk] = self._backward(pre_activations, values[chunk].size)
+        return values, gradients
 
     def _backward(self, pre_activations: list[Floats], n_points: int) -> Floats:
         adjoint = np.zeros((n_points, self.network.n_variables))
@@ -203,7 +211,8 @@ class Evaluator:
             of_t = np.zeros_like(t)
             for group in groups:
                 slopes = group.function.slopes(t[:, group.positions])
-                _accumulate(of_t, group.positions, adjoint[:, group.outputs] * slopes)
+                slopes *= adjoint[:, group.outputs]
+                _accumulate(of_t, group.positions, slopes)
             adjoint[:, contiguous(block.columns)] += of_t @ block.weights
         return adjoint[:, : self.network.input_dim]
 

@@ -73,13 +73,15 @@ def _surrogate_line(report: dict[str, Any]) -> str:
 
 
 def _polish_line(polish: dict[str, Any]) -> str:
-    line = (
-        f"  polished: mean |f_true| at vertices {polish['mean_abs_f_before']:.2g} before, {polish['mean_abs_f']:.2g} "
-        f"after (max {polish['max_abs_f']:.2g}), on faces {polish['true_mean_abs_f']:.2g}; moved by up to "
-        f"{polish['largest_move']:.2g}"
+    counts = (
+        ("divided_polygons", "polygons divided to come closer"),
+        ("held_vertices", "vertices held back so that no face turns over"),
+        ("stray_vertices", "vertices found no root in reach"),
+        ("reversed_polygons", "polygons face against the true gradient, as they did before"),
     )
-    if polish["held_vertices"]:
-        line += f"; {polish['held_vertices']:,} vertices held back so that no face turns over"
-    if polish["stray_vertices"]:
-        line += f"; {polish['stray_vertices']:,} found no root in reach"
-    return line
+    told = "".join(f"; {polish[key]:,} {what}" for key, what in counts if polish[key])
+    return (
+        f"  polished: mean |f_true| at vertices {polish['mean_abs_f_before']:.2g} before, {polish['mean_abs_f']:.2g} "
+        f"after (max {polish['max_abs_f']:.2g}), on faces {polish['true_mean_abs_f_before']:.2g} before, "
+        f"{polish['true_mean_abs_f']:.2g} after; moved by up to {polish['largest_move']:.2g}{told}"
+    )

@@ -13,7 +13,9 @@ from numpy.typing import NDArray
 from mn_onnx.errors import UsageError
 from mn_onnx.extract.face_errors import surface_errors
 from mn_onnx.extract.polish import polish
+from mn_onnx.extract.sampling import sample_surface
 from mn_onnx.extract.surface import Surface
+from mn_onnx.ir.evaluate import gradient
 from mn_onnx.ir.forecast import Forecast, forecast
 from mn_onnx.ir.network import Network
 from mn_onnx.ir.passes import Canonical, canonicalize
@@ -37,8 +39,22 @@ SHALLOW = 0.1
 """Below this part of the median slope, what an error means for the place of the surface is not foretold."""
 
 
+VAGUE = 0.05
+"""A displacement bound above this part of the largest side of the box says nothing of where the surface is."""
+
+ANGLE_SAMPLES = 1 << 14
+
 NOT_CERTIFIED: Mapping[str, None] = dict.fromkeys(
-    ("surface_eps", "surface_eps_median", "displacement", "displacement_median", "shallow_polygons")
+    (
+        "surface_eps",
+        "surface_eps_median",
+        "displacement",
+        "displacement_median",
+        "shallow_polygons",
+        "vague_polygons",
+        "gradient_angle_median",
+        "turned_share",
+    )
 )
 """The entries of `certified` where there is nothing to prove."""
 
@@ -126,6 +142,7 @@ def certified(surface: Surface, canonical: Canonical, *, threads: int | None = N
     ``attributes["eps"]`` are these errors, ``attributes["displacement"]`` how far the true level set may be from each
     polygon: eps over the slope there, to first order in eps. Where the slope is small this says little.
     """
+    side = float((canonical.upper - canonical.lower).max())
     errors = surface_errors(canonical.network, surface, canonical.lower, canonical.upper, threads=threads)
     errors = np.minimum(errors, canonical.surrogate_eps)
     slopes = np.sqrt((surface.gradients**2).sum(axis=1))
@@ -137,9 +154,35 @@ def certified(surface: Surface, canonical: Canonical, *, threads: int | None = N
         "displacement": float(displacement[steep].max()),
         "displacement_median": float(np.median(displacement)),
         "shallow_polygons": int(np.count_nonzero(~steep)),
+        "vague_polygons": int(np.count_nonzero(displacement > VAGUE * side)),
+        **_gradient_angles(surface, canonical.network),
     }
     attributes = {**surface.attributes, "eps": errors, "displacement": displacement}
     return replace(surface, errors=errors, attributes=attributes), entries
+
+
+def _gradient_angles(surface: Surface, network: Network) -> dict[str, float]:
+    """How far the gradients of the surrogates are from the true ones, at random points of the faces."""
+    points, polygons = sample_surface(surface, ANGLE_SAMPLES)
+    true, found = gradient(network, points, true_functions=True), surface.gradients[polygons]
+    lengths = np.sqrt((true**2).sum(axis=1) * (found**2).sum(axis=1))
+    cosines = np.einsum("ij,ij->i", true, found) / np.where(lengths > 0, lengths, 1.0)
+    return {
+        "gradient_angle_median": float(np.degrees(np.arccos(np.clip(np.median(cosines), -1.0, 1.0)))),
+        "turned_share": float((cosines <= 0).mean()),
+    }
+
+
+def topology_notes(certificate: Mapping[str, Any]) -> list[str]:
+    """What is to be said of the topology of a smooth network's mesh, a sentence or none."""
+    share = certificate["turned_share"]
+    if not share:
+        return []
+    return [
+        f"on about {share:.2g} of the area the gradient of the surrogates is more than 90 degrees from that of the "
+        "network: there the topology may be that of the surrogates only, with handles and pieces the network does not "
+        "have; take finer surrogates, by a larger --budget or --knots-per-period"
+    ]
 
 
 def polished(surface: Surface, canonical: Canonical, *, threads: int | None = None) -> tuple[Surface, dict[str, Any]]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -265,3 +266,16 @@ def test_undefined_part_of_the_range_is_found() -> None:
 def test_wrong_arity_is_refused() -> None:
     with pytest.raises(ValueError, match="'maximum' with 1 arguments"):
         apply("maximum", T)
+
+
+@pytest.mark.parametrize(("library", "name"), [(np.sin, "sin"), (np.cos, "cos")])
+def test_waves_of_large_arrays_agree_with_the_library(library: Callable[[np.ndarray], np.ndarray], name: str) -> None:
+    rng = np.random.default_rng(0)
+    near_quarters = np.arange(-1500, 1500) * (np.pi / 2) + rng.normal(size=3000) * 1e-6
+    t = np.concatenate([rng.uniform(-40, 40, 3000), rng.uniform(-1e6, 1e6, 3000), near_quarters, [0.0, -0.0, 1e-300]])
+    expected = library(t)
+    ulps = np.abs(evaluate(apply(name, T), t) - expected) / np.spacing(np.abs(expected))
+    assert ulps.max() < 3
+    beyond = np.concatenate([t, [1e18, np.inf, np.nan]])
+    with np.errstate(invalid="ignore"):
+        np.testing.assert_array_equal(evaluate(apply(name, T), beyond), library(beyond))

@@ -6,17 +6,20 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from ir_networks import SINE, dense
 from small_models import octahedron_model
-from smooth_models import soft_octahedron_model
+from smooth_models import HIGH, LOW, extracted, soft_octahedron_model
 
-from mn_onnx.extract.polish import polish
+from mn_onnx.extract.invariants import check_invariants
+from mn_onnx.extract.polish import FLATNESS, polish
+from mn_onnx.extract.sampling import sample_surface
 from mn_onnx.extract.surface import Surface
 from mn_onnx.extraction import extract
+from mn_onnx.ir.evaluate import evaluate, gradient
+from mn_onnx.ir.network import AffineRow, Network
 from mn_onnx.model import Model, load
 
-
-def area_vectors(surface: Surface) -> np.ndarray:
-    return np.asarray(surface.measures.area_vectors)
+ONLY_VERTICES = np.inf
 
 
 @pytest.fixture(scope="module")
@@ -24,45 +27,113 @@ def model() -> Model:
     return load(soft_octahedron_model(), bind={"code": [0.0]}, knots_per_period=6)
 
 
-def test_vertices_reach_the_level_set(model: Model) -> None:
-    before = extract(model, threads=1)
-    after = extract(model, threads=1, polish=True)
-    assert before.report["true_mean_abs_f"] > 1e-4
-    entries = after.report["polish"]
-    assert entries["mean_abs_f_before"] > 1e-4
-    assert entries["mean_abs_f"] < 1e-10
+@pytest.fixture(scope="module")
+def before(model: Model) -> Surface:
+    return extract(model, threads=1)
+
+
+def mean_on_faces(network: Network, surface: Surface) -> float:
+    points, _ = sample_surface(surface, 1 << 14)
+    return float(np.abs(evaluate(network, points, true_functions=True)).mean())
+
+
+def facing(network: Network, surface: Surface) -> np.ndarray:
+    """Areas times slopes along the normals, [p]: by the true gradients at the corners."""
+    at_corners = gradient(network, surface.vertices, true_functions=True)[surface.corners]
+    means = np.add.reduceat(at_corners, surface.offsets[:-1], axis=0) / surface.polygon_sizes[:, None]
+    return np.asarray(np.einsum("ij,ij->i", surface.measures.area_vectors, means))
+
+
+def test_vertices_reach_the_level_set(model: Model, before: Surface) -> None:
+    after, result = polish(before, model.network, LOW, HIGH, threads=1, flatness=ONLY_VERTICES)
+    assert result.mean_abs_f_before > 1e-4
+    assert result.mean_abs_f < 1e-10
     assert np.abs(model.evaluate(after.vertices)).mean() < 1e-10
-    assert entries["held_vertices"] == 0
-    assert entries["largest_move"] <= 2 * before.attributes["displacement"].max()
+    assert result.vertices_within_1e_9 == before.n_vertices
+    assert (result.held_vertices, result.stray_vertices, result.turned_polygons, result.divided_polygons) == (0,) * 4
+    assert 0 < result.largest_move <= 2 * before.attributes["displacement"].max()
     np.testing.assert_array_equal(before.corners, after.corners)
     np.testing.assert_array_equal(before.twins, after.twins)
-    assert (np.einsum("ij,ij->i", area_vectors(before), area_vectors(after)) > 0).all()
+    assert (np.einsum("ij,ij->i", before.measures.area_vectors, after.measures.area_vectors) > 0).all()
+
+
+def test_faces_come_closer_too_and_as_close_as_asked(model: Model, before: Surface) -> None:
+    wanted = 0.1 * mean_on_faces(model.network, before)
+    slope = float(np.median(np.sqrt((before.gradients**2).sum(axis=1))))
+    divided, result = polish(before, model.network, LOW, HIGH, threads=1, flatness=wanted / slope)
+    assert before.n_polygons < result.divided_polygons < divided.n_polygons < 30 * before.n_polygons
+    assert mean_on_faces(model.network, divided) < 1.3 * wanted
+    invariants = check_invariants(divided)
+    assert invariants.problems() == []
+    assert (invariants.euler, len(invariants.components)) == (2, 1)
+    assert np.abs(evaluate(model.network, divided.vertices, true_functions=True)).max() < 1e-8
+    np.testing.assert_array_equal(np.unique(divided.errors), np.unique(before.errors))
+
+
+def test_faces_that_are_fine_enough_stay_whole() -> None:
+    fine = load(soft_octahedron_model(), bind={"code": [0.0]}, knots_per_period=16)
+    surface = extract(fine, threads=1)
+    polished, result = polish(surface, fine.network, LOW, HIGH, threads=1, flatness=0.01)
+    assert result.divided_polygons == 0
+    assert polished.n_polygons == surface.n_polygons
+
+
+def test_the_report_tells_of_the_polished_mesh(model: Model) -> None:
+    report = extract(model, threads=1, polish=True).report
+    entries = report["polish"]
+    assert entries["true_mean_abs_f_before"] > 1e-4
+    assert entries["true_mean_abs_f"] < 0.01 * entries["true_mean_abs_f_before"]
+    assert report["polygons"] > 100 * report["forecast_polygons"]
+    assert (report["closed"], report["euler"], report["problems"]) == (True, 2, [])
+    assert report["turned_share"] == 0
+    assert 0 < report["gradient_angle_median"] < 45
 
 
 def test_vertices_on_the_box_stay_on_its_faces() -> None:
     cut = load(soft_octahedron_model(), bind={"code": [0.0]}, knots_per_period=6, bounds=[-0.21, 1, -1, 1, -1, 0.17])
     before, after = extract(cut, threads=1), extract(cut, threads=1, polish=True)
     assert before.boundary.size > 0
-    for axis, side in ((0, -0.21), (2, 0.17)):
-        on_face = before.vertices[:, axis] == side
-        assert on_face.any()
-        np.testing.assert_array_equal(after.vertices[on_face, axis], side)
-    assert after.report["closed"]
+    for surface in (before, after):
+        for axis, face, side in ((0, 0, -0.21), (2, 5, 0.17)):
+            tails = surface.corners[surface.box_faces == face]
+            assert tails.size > 0
+            np.testing.assert_array_equal(surface.vertices[tails, axis], side)
+    assert after.report["problems"] == []
     assert after.report["polish"]["mean_abs_f"] < 1e-10
 
 
-def test_no_face_turns_over(model: Model) -> None:
-    """With errors that are taken to be large, vertices of a mesh folded on purpose may not pass each other."""
-    surface = extract(model, threads=1)
+def test_no_face_turns_over(model: Model, before: Surface) -> None:
+    """Of a mesh that was folded on purpose, no face that was upright turns over, and most others turn back."""
     rng = np.random.default_rng(0)
-    shaken = replace(
-        surface,
-        vertices=surface.vertices + rng.normal(size=surface.vertices.shape) * 0.004,
-        errors=np.full(surface.n_polygons, 0.05),
-    )
-    moved, result = polish(shaken, model.network, model.lower, model.upper, threads=1)
-    assert (np.einsum("ij,ij->i", area_vectors(shaken), area_vectors(moved)) >= 0).all()
-    assert result.mean_abs_f < 0.1 * result.mean_abs_f_before
+    shaken = replace(before, vertices=before.vertices + rng.normal(size=before.vertices.shape) * 0.02)
+    upright = facing(model.network, shaken) > 0
+    assert 0 < np.count_nonzero(~upright) < 0.5 * upright.size
+    moved, result = polish(shaken, model.network, LOW, HIGH, threads=1, flatness=ONLY_VERTICES)
+    after = facing(model.network, moved)
+    assert (after[upright] >= 0).all()
+    assert result.turned_polygons == np.count_nonzero(~upright)
+    assert result.reversed_polygons == np.count_nonzero(after < 0) <= 0.2 * result.turned_polygons
+    assert result.slid_vertices > 0
+
+
+def test_a_coarse_sine_network_is_polished_without_turning_faces() -> None:
+    """Surrogates that are far off: gradients differ by tens of degrees, and vertices move by many polygons."""
+    network = dense([8, 8], SINE, seed=4)
+    canonical, surface = extracted(network, knots=5, lower=0.3 * LOW, upper=0.3 * HIGH)
+    upright = facing(canonical.network, surface) > 0
+    moved, result = polish(surface, canonical.network, 0.3 * LOW, 0.3 * HIGH, threads=1, flatness=ONLY_VERTICES)
+    assert (facing(canonical.network, moved)[upright] >= 0).all()
+    assert result.mean_abs_f < 0.05 * result.mean_abs_f_before
+    assert check_invariants(moved).problems() == []
+
+
+def test_what_is_not_near_the_level_set_is_told(model: Model, before: Surface) -> None:
+    """A network without any level set: every vertex strays."""
+    output = model.network.output
+    lifted = replace(model.network, output=AffineRow(output.columns, output.weights, output.bias + 10.0))
+    _, result = polish(before, lifted, LOW, HIGH, threads=1, flatness=FLATNESS)
+    assert result.stray_vertices + result.held_vertices == before.n_vertices
+    assert result.vertices_within_1e_6 == result.divided_polygons == 0
 
 
 def test_exact_networks_have_nothing_to_polish() -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Callable
+from types import ModuleType
 
 import numpy as np
 
@@ -21,15 +22,33 @@ def sigmoid(x: Floats) -> Floats:
 
 def softplus(x: Floats) -> Floats:
     """``log(1 + exp(x))`` without overflow."""
-    return np.logaddexp(0.0, x)
+    return np.maximum(x, 0.0) + np.log1p(np.exp(-np.abs(x)))
 
 
 @functools.cache
-def _compiled_erf() -> Callable[[Floats], Floats]:
+def _compiled() -> ModuleType:
     # Imported here because compiled code is only worth its start-up time for large arrays.
-    from mn_onnx.ir.scalar.compiled import erf as compiled
+    from mn_onnx.ir.scalar import compiled
 
-    return compiled  # type: ignore[no-any-return]
+    return compiled
+
+
+def _wave(x: Floats, quarters: int, library: Callable[[Floats], Floats]) -> Floats:
+    values = np.asarray(x, np.float64)
+    if values.size <= SMALL or not np.abs(values).max() <= _compiled().LARGEST_ARGUMENT:
+        return library(values)
+    result: Floats = _compiled().wave(values, quarters)
+    return result
+
+
+def sin(x: Floats) -> Floats:
+    """The sine, within 2.1 units in the last place."""
+    return _wave(x, 0, np.sin)
+
+
+def cos(x: Floats) -> Floats:
+    """The cosine, within 2.1 units in the last place."""
+    return _wave(x, 1, np.cos)
 
 
 def erf(x: Floats) -> Floats:
@@ -37,7 +56,8 @@ def erf(x: Floats) -> Floats:
     values = np.asarray(x, np.float64)
     if values.size <= SMALL:
         return np.array([math.erf(value) for value in values.ravel().tolist()]).reshape(values.shape)
-    return _compiled_erf()(values)
+    result: Floats = _compiled().erf(values)
+    return result
 
 
 def sech_squared(x: Floats) -> Floats:
