@@ -12,7 +12,7 @@ from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 import mn_onnx.extract as _extract_package
-from mn_onnx.kernel_cache import ensure_place_for_kernels, user_cache
+from mn_onnx.kernel_cache import drop_stale_kernels, ensure_place_for_kernels, user_cache
 
 if TYPE_CHECKING:
     from mn_onnx.errors import CheckFailed, MnOnnxError, ModelRefused, Problem, UsageError
@@ -71,6 +71,7 @@ class _CallablePackage(ModuleType):
 _extract_package.__class__ = _CallablePackage
 
 ensure_place_for_kernels(Path(__file__).parent, user_cache())
+drop_stale_kernels(Path(_extract_package.__path__[0], "kernels"))
 
 
 def __getattr__(name: str) -> Any:

@@ -1,4 +1,4 @@
-"""Where compiled kernels are kept when numba would find no place for them."""
+"""What numba leaves to be done about its cache of compiled kernels: a place in every case, and no stale kernels."""
 
 from __future__ import annotations
 
@@ -34,6 +34,28 @@ def user_cache() -> Path:
     else:
         base = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
     return Path(base) / "numba"
+
+
+def drop_stale_kernels(folder: Path) -> None:
+    """Delete the compiled kernels of ``folder`` if any is older than any source there.
+
+    numba compares a kernel with its own file only, not with the constants and kernels that it takes from others.
+    """
+    compiled = [*folder.glob("__pycache__/*.nbi"), *folder.glob("__pycache__/*.nbc")]
+    if not compiled or not _takes_files(folder / "__pycache__"):  # what numba cannot write to it does not read
+        return
+    newest = max(source.stat().st_mtime for source in folder.glob("*.py"))
+    if min(_modified(file) for file in compiled) < newest:
+        for file in compiled:
+            file.unlink(missing_ok=True)
+
+
+def _modified(file: Path) -> float:
+    """When ``file`` was written; never, if another process deletes it just now."""
+    try:
+        return file.stat().st_mtime
+    except FileNotFoundError:
+        return float("inf")
 
 
 def _takes_files(folder: Path) -> bool:

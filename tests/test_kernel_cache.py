@@ -1,4 +1,4 @@
-"""Compiled kernels find a place where neither the installation nor the home of the user takes files."""
+"""Compiled kernels find a place where neither installation nor home take files, and go when a source has changed."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from mn_onnx.kernel_cache import VARIABLE, ensure_place_for_kernels
+from mn_onnx.kernel_cache import VARIABLE, drop_stale_kernels, ensure_place_for_kernels
 
 
 @pytest.fixture
@@ -54,3 +54,19 @@ def test_a_folder_that_others_can_write_to_is_not_trusted(nowhere: Path, tmp_pat
     assert folder not in (None, prepared)
     assert folder is not None
     assert folder.stat().st_mode & 0o077 == 0
+
+
+def test_a_change_of_any_source_drops_all_compiled_kernels(tmp_path: Path) -> None:
+    sources = [tmp_path / name for name in ("constants.py", "kernel.py")]
+    compiled = [tmp_path / "__pycache__" / name for name in ("kernel.nbi", "kernel.nbc")]
+    other = tmp_path / "__pycache__" / "kernel.pyc"
+    other.parent.mkdir()
+    drop_stale_kernels(tmp_path)  # nothing there yet
+    for time, file in enumerate([*sources, *compiled, other], start=1000):
+        file.write_bytes(b"")
+        os.utime(file, (time, time))
+    drop_stale_kernels(tmp_path)
+    assert all(file.exists() for file in compiled)
+    os.utime(sources[0], (2000, 2000))
+    drop_stale_kernels(tmp_path)
+    assert [file.exists() for file in (*compiled, other)] == [False, False, True]
