@@ -21,7 +21,10 @@ def mesh_summary(mesh: str, report: dict[str, Any]) -> str:
     if "bounds" in report:
         lines.append(f"  box: {box_text(report)}")
     if report["max_abs_f"] is not None:
-        lines.append(f"  |f| on the mesh: max {report['max_abs_f']:.2g}, mean {report['mean_abs_f']:.2g}")
+        lines.append(
+            f"  |f| at {report['residual_points']:,} points of the mesh: max {report['max_abs_f']:.2g}, "
+            f"mean {report['mean_abs_f']:.2g}"
+        )
     if not report["exact"]:
         lines.append(_surrogate_line(report))
     if report.get("surface_eps") is not None:
