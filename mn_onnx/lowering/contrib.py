@@ -8,7 +8,7 @@ from collections.abc import Callable
 import numpy as np
 
 from mn_onnx.ir.expression import Expression, apply, constant
-from mn_onnx.lowering import formulas, linear
+from mn_onnx.lowering import formulas, linear, shape
 from mn_onnx.lowering.activation import elementwise, number
 from mn_onnx.lowering.context import Context
 from mn_onnx.lowering.indexing import indices_of, wrapped
@@ -153,6 +153,9 @@ MICROSOFT: Table = {
     "QuickGelu": elementwise(lambda n, x: formulas.swish(x, number(n, "alpha", 1.702))),
     "DequantizeLinear": same(dequantize, on_constants=True),
     "MatMulNBits": same(matmul_of_packed_weights),
+    "ExpandDims": same(shape.unsqueeze, on_constants=True),
+    "Trilu": same(shape.triangle, on_constants=True),
+    "Pad": same(shape.pad_by_inputs, on_constants=True),
 }
 
 MACHINE_LEARNING: Table = {
