@@ -26,8 +26,8 @@ from mn_onnx.ir.levels import LevelBlock, contiguous, level_blocks
 from mn_onnx.ir.network import Floats, Integers, KnotTable, Network
 from mn_onnx.ir.surrogate.local_deviation import finer_table
 
-CHUNK_BYTES = 1 << 25
-"""Working memory of one thread, about."""
+CHUNK_BYTES = 1 << 21
+"""Working memory of one thread, about: what its caches hold."""
 
 EPS = float(np.finfo(np.float64).eps)
 
@@ -36,14 +36,18 @@ EPS = float(np.finfo(np.float64).eps)
 class _Level:
     """A level of units with what bounds its errors.
 
-    ``kind``: int64 [o]; ``limits``: bounds of the pre-activations, [u] each; ``rounding``: [u], how far computed
-    pre-activations may be from exact ones anywhere in the box.
+    ``columns``, ``outputs``: those of ``block``, as slices where they are consecutive. ``kind``: int64 [o]. ``size``:
+    [u, c], the magnitudes of the weights with room for rounding. ``limits``: bounds of the pre-activations, [u] each.
+    ``rounding``: [u], how far computed pre-activations may be from exact ones anywhere in the box.
     """
 
     block: LevelBlock
+    columns: slice | Integers
+    outputs: slice | Integers
     tables: Tables
     finer: Tables
     kind: Integers
+    size: Floats
     limits: tuple[Floats, Floats]
     rounding: Floats
 
@@ -116,8 +120,7 @@ class _PolygonBound:
         middle, spread = np.zeros((n, variables)), np.zeros((n, variables))
         found = []
         for level in self.levels:
-            block = level.block
-            columns, outputs = contiguous(block.columns), contiguous(block.outputs)
+            block, columns, outputs = level.block, level.columns, level.outputs
             t = at_points[:, columns] @ block.weights.T + block.bias
             values = np.empty((points.shape[0], block.outputs.size))
             table_values(level.tables, block.owner, level.kind, t, values)
@@ -125,17 +128,15 @@ class _PolygonBound:
             low, high = np.empty((n, block.units.size)), np.empty((n, block.units.size))
             corner_ranges(t, rows, offsets, low, high)
             t_middle = middle[:, columns] @ block.weights.T
-            t_spread = spread[:, columns] @ np.abs(block.weights).T
-            t_spread *= 1 + EPS * (block.columns.size + 8)
+            t_spread = spread[:, columns] @ level.size.T
             shape = (n, block.outputs.size)
             slope, centre, radius = np.empty(shape), np.empty(shape), np.empty(shape)
-            of_t = (t_middle, t_spread)
+            of_t, of_outputs = (t_middle, t_spread), (np.empty(shape), np.empty(shape))
             advance_errors(
                 level.tables, level.finer, block.owner, level.kind, (low, high), level.limits, level.rounding, of_t,
-                slope, centre, radius,
+                slope, centre, radius, of_outputs,
             )  # fmt: skip
-            middle[:, outputs] = slope * t_middle[:, block.owner] + centre
-            spread[:, outputs] = np.abs(slope) * t_spread[:, block.owner] + radius
+            middle[:, outputs], spread[:, outputs] = of_outputs
             found.append((slope, centre, radius))
         return self._total(n, found)
 
@@ -145,12 +146,12 @@ class _PolygonBound:
         signed, unsigned, size = np.zeros(n), np.zeros(n), np.zeros(n)
         for level, (slope, centre, radius) in zip(reversed(self.levels), reversed(found), strict=True):
             block = level.block
-            of_outputs = adjoint[:, contiguous(block.outputs)]
+            of_outputs = adjoint[:, level.outputs]
             signed += (of_outputs * centre).sum(axis=1)
             magnitude = np.abs(of_outputs)
             unsigned += (magnitude * radius).sum(axis=1)
             size += (magnitude * np.abs(centre)).sum(axis=1)
-            adjoint[:, contiguous(block.columns)] += block.sum_outputs(of_outputs * slope) @ block.weights
+            adjoint[:, level.columns] += block.sum_outputs(of_outputs * slope) @ block.weights
         rounding = EPS * (self.network.n_variables + 8) * len(self.levels)
         total: Floats = np.abs(signed) + unsigned + rounding * (size + unsigned) + self.output_rounding
         return total
@@ -169,7 +170,9 @@ def _level(
     steepness = tables.steepest[kind]
     magnitude[block.outputs] = steepness * largest + intercept
     rounding[block.outputs] = steepness * of_t[block.owner] + 4 * EPS * magnitude[block.outputs]
-    return _Level(block, tables, finer, kind, limits, of_t)
+    room = 1 + EPS * (block.columns.size + 8)
+    columns, outputs = contiguous(block.columns), contiguous(block.outputs)
+    return _Level(block, columns, outputs, tables, finer, kind, size * room, limits, of_t)
 
 
 def _kinds(network: Network, block: LevelBlock, limits: tuple[Floats, Floats]) -> tuple[Tables, Tables, Integers]:

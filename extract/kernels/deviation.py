@@ -37,9 +37,11 @@ class Tables(NamedTuple):
     steepest: Floats
 
 
-@numba.njit(cache=True, nogil=True, inline="always")
-def _interval(starts: Floats, low: int, end: int, t: float) -> int:
-    """The interval of ``t`` among ``low`` .. ``end - 1``."""
+@numba.njit(cache=True, nogil=True)
+def _interval(starts: Floats, low: int, end: int, guess: int, t: float) -> int:
+    """The interval of ``t`` among ``low`` .. ``end - 1``; found at once if it is ``guess``."""
+    if starts[guess] <= t and (guess + 1 == end or t < starts[guess + 1]):
+        return guess
     high = end - 1
     while low < high:
         middle = (low + high + 1) >> 1
@@ -53,11 +55,13 @@ def _interval(starts: Floats, low: int, end: int, t: float) -> int:
 @numba.njit(cache=True, nogil=True)
 def table_values(tables: Tables, owner: Integers, kind: Integers, t: Floats, result: Floats) -> None:
     """Outputs [n, o] at pre-activations ``t`` [n, u]; output ``j`` is table ``kind[j]`` of unit ``owner[j]``."""
+    last = tables.first[kind]
     for point in range(t.shape[0]):
         for output in range(owner.size):
             which = kind[output]
             at = t[point, owner[output]]
-            i = _interval(tables.starts, tables.first[which], tables.first[which + 1], at)
+            i = _interval(tables.starts, tables.first[which], tables.first[which + 1], last[output], at)
+            last[output] = i
             result[point, output] = tables.slopes[i] * at + tables.intercepts[i]
 
 
@@ -79,10 +83,10 @@ def corner_ranges(t: Floats, rows: Integers, offsets: Integers, low: Floats, hig
 
 
 @numba.njit(cache=True, nogil=True, inline="always")
-def _deviation(tables: Tables, which: int, slope: float, intercept: float, a: float, b: float) -> tuple[float, float]:
-    """The range on ``[a, b]`` of the function that table ``which`` follows, less a line."""
-    first = _interval(tables.starts, tables.first[which], tables.first[which + 1], a)
-    i = first
+def _deviation(
+    tables: Tables, which: int, i: int, slope: float, intercept: float, a: float, b: float
+) -> tuple[float, float]:
+    """The range on ``[a, b]`` of the function that table ``which`` follows, less a line; ``a`` is in interval ``i``."""
     end = tables.first[which + 1]
     value = (tables.slopes[i] - slope) * a + (tables.intercepts[i] - intercept)
     least, greatest = value - tables.errors[i], value + tables.errors[i]
@@ -108,29 +112,38 @@ def advance_errors(
     slope: Floats,
     centre: Floats,
     radius: Floats,
+    of_outputs: tuple[Floats, Floats],
 ) -> None:
-    """Slopes of a level's outputs, and enclosures ``centre +- radius`` of ``D_i``; all [n, o].
+    """Slopes of a level's outputs, enclosures ``centre +- radius`` of ``D_i``, and of their errors; all [n, o].
 
     ``tables``: those of the surrogate network; ``finer``: tables of the same functions, with smaller errors.
     ``ranges``: least and greatest pre-activations of the surrogate network on each polygon, [n, u] each, known up to
     ``rounding`` [u]. ``limits``: [u] each, proved bounds of all pre-activations of both networks. ``of_t``: the
-    enclosure ``m +- r`` of ``dt``, [n, u] each.
+    enclosure ``m +- r`` of ``dt``, [n, u] each; ``of_outputs``: that of the outputs' errors, filled in.
     """
     low, high = ranges
     lowest, highest = limits
     middle, spread = of_t
+    output_middle, output_spread = of_outputs
+    # Polygons that follow one another are close to one another.
+    last, last_finer = tables.first[kind], finer.first[kind]
     for polygon in range(low.shape[0]):
         for output in range(owner.size):
             unit, which = owner[output], kind[output]
             begin, end = tables.first[which], tables.first[which + 1]
             at = 0.5 * (low[polygon, unit] + high[polygon, unit])
-            home = _interval(tables.starts, begin, end, at)
+            home = _interval(tables.starts, begin, end, last[output], at)
+            last[output] = home
             reach = spread[polygon, unit] + rounding[unit]
             a = max(low[polygon, unit] + middle[polygon, unit] - reach, lowest[unit])
             b = max(a, min(high[polygon, unit] + middle[polygon, unit] + reach, highest[unit]))
             line, shift = tables.slopes[home], tables.intercepts[home]
-            least, greatest = _deviation(finer, which, line, shift, a, b)
+            first = _interval(finer.starts, finer.first[which], finer.first[which + 1], last_finer[output], a)
+            last_finer[output] = first
+            least, greatest = _deviation(finer, which, first, line, shift, a, b)
             slope[polygon, output] = line
             centre[polygon, output] = 0.5 * (least + greatest)
             # A corner may lie past the end of its interval by rounding, where the lines differ by so much.
             radius[polygon, output] = 0.5 * (greatest - least) + 2 * tables.steepest[which] * rounding[unit]
+            output_middle[polygon, output] = line * middle[polygon, unit] + centre[polygon, output]
+            output_spread[polygon, output] = abs(line) * spread[polygon, unit] + radius[polygon, output]
