@@ -13,7 +13,7 @@ from small_models import octahedron_model
 
 import mn_onnx
 from mn_onnx.checks.parity import check_parity, coarsest_rounding, probe_points
-from mn_onnx.checks.runtime import CHUNK, Runtime
+from mn_onnx.checks.runtime import BATCH, Runtime
 
 Floats = NDArray[np.float64]
 
@@ -43,12 +43,12 @@ class Faulty:
     def __init__(self, model: mn_onnx.Model, largest_batch: int, error: float) -> None:
         self.model, self.largest_batch, self.error = model, largest_batch, error
 
-    def evaluate(self, points: Floats, *, batch: int = CHUNK) -> Floats:
+    def evaluate(self, points: Floats, *, batch: int = BATCH) -> Floats:
         return self.model.evaluate(points) + (self.error if batch <= self.largest_batch else 0.0)
 
 
 @pytest.mark.parametrize("error", [1e-4, np.nan])
-@pytest.mark.parametrize("largest_batch", [1, 2, 7, CHUNK])
+@pytest.mark.parametrize("largest_batch", [1, 2, 7, BATCH])
 def test_an_error_in_batches_of_some_size_is_found(model: mn_onnx.Model, largest_batch: int, error: float) -> None:
     runtime = cast(Runtime, Faulty(model, largest_batch, error))
     (problem,) = check_parity(model, runtime).problems()

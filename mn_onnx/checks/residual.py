@@ -18,8 +18,8 @@ Floats = NDArray[np.float64]
 FACE_SAMPLES = 1 << 15
 """Points of the faces: the standard error of mean |f| is 0.6 % of its standard deviation."""
 
-MOST_VERTICES = 1 << 16
-"""An extraction measures this many of its vertices, chosen at random: a fault of one vertex in 10,000 escapes it with a
+MOST_VERTICES = 1 << 15
+"""An extraction measures this many of its vertices, chosen at random: a fault of one vertex in 5,000 escapes it with a
 probability of exp(-6.5), or 0.15 %. `mn_onnx.checks.verification.verify` measures them all."""
 
 JUDGED_POINTS = 1 << 10

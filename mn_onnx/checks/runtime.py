@@ -19,8 +19,10 @@ from mn_onnx.reader import ReadModel
 Floats = NDArray[np.float64]
 Run = Callable[[Feeds], Mapping[str, NDArray[Any]]]
 
-CHUNK = 1 << 16
-"""Points per call, and the largest static batch that is run."""
+LARGEST_BATCH = 1 << 16
+"""The largest static batch that is run."""
+BATCH = 1 << 12
+"""Points per call where the model takes any number: few enough for the caches of a core, whatever the width."""
 CALLS = 1 << 14
 """Most calls for one measurement: a model that takes one point at a time is asked at this many points."""
 
@@ -44,12 +46,12 @@ class Runtime:
     """
 
     def __init__(self, read: ReadModel, layout: Layout, *, threads: int | None = None) -> None:
-        if layout.batch is not None and layout.batch > CHUNK:
+        if layout.batch is not None and layout.batch > LARGEST_BATCH:
             reason = f"takes {layout.batch:,} points at once, too many to run it for comparison"
-            remedy = f"export it with a free batch axis or a batch of at most {CHUNK:,} points; {_REMEDY}"
+            remedy = f"export it with a free batch axis or a batch of at most {LARGEST_BATCH:,} points; {_REMEDY}"
             raise ModelRefused([Problem("", "", 0, reason, remedy)])
         self._layout = layout
-        self.most_points = CALLS * (layout.batch or CHUNK)
+        self.most_points = CALLS * (layout.batch or BATCH)
         self.note = ""
         try:
             self._run = _onnxruntime(read.original, layout.output.name, threads)
@@ -59,7 +61,7 @@ class Runtime:
             self._run = _reference(read.original, layout.output.name, self.note)
             self.name = f"onnx.reference {onnx.__version__}"
 
-    def evaluate(self, points: Floats, *, batch: int = CHUNK) -> Floats:
+    def evaluate(self, points: Floats, *, batch: int = BATCH) -> Floats:
         """Values float64 [n] at ``points`` [n, dim], ``batch`` points a call (or as many as a static model takes).
 
         Raises `CheckFailed` if the program stops with an error.
