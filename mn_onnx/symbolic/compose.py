@@ -132,8 +132,8 @@ class Composer:
         problem = self.report(
             self.store.step_nodes[function],
             f"the result is not a continuous function of the point: {reason}",
-            "export the field before it is rounded, quantised, thresholded or classified; where a comparison only guards "
-            "a quotient such as sin(t)/t, export sin(s)/s with s = sqrt(t*t + 1e-8) instead",
+            "export the field before it is rounded, quantised, thresholded or classified; where a comparison only "
+            "guards a quotient such as sin(t)/t, export sin(s)/s with s = sqrt(t*t + 1e-8) instead",
         )
         return self.store.refuse(problem)
 
