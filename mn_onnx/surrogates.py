@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
@@ -23,16 +23,28 @@ from mn_onnx.ir.passes import Canonical, canonicalize
 Floats = NDArray[np.float64]
 
 DEFAULT_BUDGET = 2_500_000
-"""Polygons (segments in two dimensions): about a minute of traversal on two cores."""
+"""Polygons (segments in two dimensions): about a minute on two cores."""
+
+TOPOLOGY_BUDGET = 12_000_000
+"""Polygons at most, where fewer would not have the network's topology: some minutes on two cores."""
+
+TRUSTED_ANGLE = 14.0
+"""Degrees that the gradients of the surrogates may be off in the median for the mesh to have the right topology. That
+share of the area where they are off by more than 90, and where handles and pieces of their own arise, falls with it:
+measured on a SIREN, 3e-3 at 24 degrees (five handles too many), 4e-5 at 14 (none)."""
 
 DEFAULT_KNOTS = 16.0
 FEWEST_KNOTS = 2.0
-MOST_ROUNDS = 4
 
-THREAD_SECONDS = 1e-4
+MOST_ROUNDS = 8
+ENOUGH = 0.8
+"""Of the budget, so that no finer surrogates are looked for; the search aims at `AIM`."""
+AIM = 0.92
+
+THREAD_SECONDS = 5e-5
 """Of traversal, bounds and checks for one polygon; measured on a server of two cores."""
 
-BYTES = 1500
+BYTES = 800
 """Of memory at the peak for one polygon."""
 
 SHALLOW = 0.1
@@ -61,10 +73,15 @@ NOT_CERTIFIED: Mapping[str, None] = dict.fromkeys(
 
 @dataclass(frozen=True, eq=False)
 class Fineness:
-    """How finely a smooth network is followed: ``knots_per_period`` (None where a tolerance decides), and the cost."""
+    """How finely a smooth network is followed: ``knots_per_period`` (None where a tolerance decides), and the cost.
+
+    ``limit``: the polygons that were to be kept to; where even the coarsest surrogates give more and no budget was
+    asked for, the forecast exceeds it.
+    """
 
     knots_per_period: float | None
     forecast: Forecast
+    limit: float
 
     def cost(self, threads: int) -> str:
         """What the extraction is expected to cost on ``threads`` threads, a sentence."""
@@ -72,7 +89,8 @@ class Fineness:
         seconds = max(1.0, pieces * THREAD_SECONDS / threads)
         time = f"{seconds:.0f} s" if seconds < 120 else f"{seconds / 60:.0f} min"
         fineness = "" if self.knots_per_period is None else f" at {self.knots_per_period:.3g} knots per period"
-        return f"about {pieces:,.0f} polygons{fineness}: about {time} and {pieces * BYTES / 1e9:.1f} GB"
+        excess = f", more than the usual {self.limit:,.0f}" if pieces > self.limit else ""
+        return f"about {pieces:,.0f} polygons{excess}{fineness}: about {time} and {pieces * BYTES / 1e9:.1f} GB"
 
 
 def canonical_within_budget(
@@ -88,23 +106,24 @@ def canonical_within_budget(
     """The canonical network, and how finely it follows a smooth one (None for an exact one).
 
     What is asked for decides: a tolerance, or a number of knots. Without either the surrogates are as fine as
-    ``budget`` polygons allow, and no finer than `DEFAULT_KNOTS`.
+    ``budget`` polygons allow, and no finer than `DEFAULT_KNOTS`. Without a budget this is `DEFAULT_BUDGET`; but where
+    the topology could not be trusted then, they are as fine as that takes, up to `TOPOLOGY_BUDGET`.
 
     Raises `UsageError` with the cost if what is asked for, or the coarsest surrogates, take more polygons than
     ``budget``; and as `canonicalize`.
     """
 
-    def attempt(knots: float | None) -> tuple[Canonical, Fineness | None]:
+    def attempt(knots: float | None, limit: float) -> tuple[Canonical, Fineness | None]:
         canonical = canonicalize(
             network, lower=lower, upper=upper, level=level, surrogate_tol=surrogate_tol, knots_per_period=knots
         )
         if canonical.is_exact or canonical.empty_reason:
             return canonical, None
-        return canonical, Fineness(knots, forecast(canonical.network, lower, upper))
+        return canonical, Fineness(knots, forecast(canonical.network, lower, upper), limit)
 
     if surrogate_tol is not None or knots_per_period is not None:
-        canonical, fineness = attempt(knots_per_period)
         limit = budget if budget is not None else np.inf if surrogate_tol is None else DEFAULT_BUDGET
+        canonical, fineness = attempt(knots_per_period, limit)
         if fineness is not None and fineness.forecast.pieces > limit:
             raise UsageError(
                 f"this would give {fineness.cost(1)} on one thread, more than the budget of {limit:,.0f} polygons; "
@@ -113,22 +132,61 @@ def canonical_within_budget(
             )
         return canonical, fineness
     limit = DEFAULT_BUDGET if budget is None else budget
-    knots = DEFAULT_KNOTS
-    canonical, fineness = attempt(knots)
-    for _ in range(MOST_ROUNDS):
-        if fineness is None or fineness.forecast.pieces <= limit or knots <= FEWEST_KNOTS or lower.size == 1:
-            break
-        # Polygons go with the square of the knots at most, segments with the knots.
-        share = 0.95 * limit / fineness.forecast.pieces
-        knots = max(FEWEST_KNOTS, knots * share ** (1 / (lower.size - 1)))
-        canonical, fineness = attempt(knots)
-    if budget is not None and fineness is not None and fineness.forecast.pieces > budget and knots <= FEWEST_KNOTS:
+    canonical, fineness = _finest(attempt, limit, DEFAULT_KNOTS, lower.size)
+    if fineness is None or fineness.knots_per_period is None:
+        return canonical, fineness
+    if budget is None and fineness.knots_per_period < DEFAULT_KNOTS and fineness.forecast.angle > TRUSTED_ANGLE:
+        # Angles are in proportion to the distance of knots.
+        ratio = math.tan(math.radians(fineness.forecast.angle)) / math.tan(math.radians(TRUSTED_ANGLE))
+        most = min(DEFAULT_KNOTS, ratio * fineness.knots_per_period)
+        return _finest(attempt, TOPOLOGY_BUDGET, most, lower.size)
+    if budget is not None and fineness.forecast.pieces > budget:
         raise UsageError(
             f"even the coarsest surrogates give {fineness.cost(1)} on one thread, "
             f"more than the budget of {budget:,.0f}; "
             f"give --budget {_rounded_up(fineness.forecast.pieces)}, or choose a smaller box"
         )
     return canonical, fineness
+
+
+def _finest(
+    attempt: Callable[[float | None, float], tuple[Canonical, Fineness | None]],
+    limit: float,
+    most_knots: float,
+    dimension: int,
+) -> tuple[Canonical, Fineness | None]:
+    """The finest surrogates of at most ``most_knots`` and ``limit`` pieces, or else the coarsest of all.
+
+    Lines on the surface are those of knots that exact functions have, and others in proportion to the knots per period;
+    pieces go with their square in three dimensions. So its root is interpolated.
+    """
+    exponent = 1 / max(1, dimension - 1)
+    goal = (AIM * limit) ** exponent
+    fits: tuple[Canonical, Fineness | None] | None = None
+    low, high = FEWEST_KNOTS, most_knots
+    knots = most_knots
+    before: tuple[float, float] | None = None
+    for _ in range(MOST_ROUNDS):
+        found = attempt(knots, limit)
+        if found[1] is None or dimension == 1:
+            return found
+        pieces = found[1].forecast.pieces
+        root = pieces**exponent
+        if pieces <= limit:
+            fits, low = found, knots
+            if knots >= most_knots or pieces >= ENOUGH * limit:
+                return found
+        elif knots <= FEWEST_KNOTS:
+            return found
+        else:
+            high = knots
+        # A secant; at first through the origin.
+        slope = root / knots if before is None else (root - before[1]) / (knots - before[0])
+        before = knots, root
+        knots = knots + (goal - root) / slope if slope > 0 else 0.5 * (low + high)
+        if not low < knots < high:
+            knots = FEWEST_KNOTS if fits is None else 0.5 * (low + high)
+    return fits or attempt(FEWEST_KNOTS, limit)
 
 
 def _rounded_up(number: float) -> int:
