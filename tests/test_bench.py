@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import io
 import json
 import signal
@@ -15,6 +16,7 @@ import onnx
 import pytest
 from numpy.typing import NDArray
 from onnx import TensorProto, helper
+from rich.console import Console
 from small_models import TILT, octahedron_model, refused_model
 
 import mn_onnx
@@ -24,7 +26,7 @@ from mn_onnx.bench.quality import soft_precision, soft_recall
 from mn_onnx.bench.result import BenchResult, Measurement, ModelResult
 from mn_onnx.bench.run import in_fresh_process
 from mn_onnx.bench.sampler import fastest, open_runtime
-from mn_onnx.bench.table import markdown
+from mn_onnx.bench.table import markdown, print_result
 from mn_onnx.bench.worker import Failure, Job
 from mn_onnx.checks.runtime import Runtime
 from mn_onnx.cli import EXIT_CHECK, EXIT_USAGE, main
@@ -110,6 +112,18 @@ def test_a_table_is_printed(folder: Path) -> None:
     assert "…" not in table  # eighty columns suffice
     for words in ("octahedron.onnx, 1 threads, median of 2", "marching cubes 8^3", "exact: traverse", "before: import"):
         assert words in table
+
+
+def test_large_numbers_fit_into_eighty_columns() -> None:
+    values = {"polygons": 5_657_854, "triangles": 11_315_704, "vertices": 5_657_850, "corners": 22_631_412}
+    times = {"preparation": {}, "warm_up": 0.3, "seconds": {}, "peak_bytes": 3 << 30, "idle_bytes": 1 << 28}
+    quality = {"components": 1, "euler": 2, "soft_precision": 1.2e-16, "soft_recall": 0.00012}
+    exact = Measurement("exact", None, **times, total=289.123, **values, **quality)  # type: ignore[arg-type]
+    sampled = dataclasses.replace(exact, method="marching cubes", resolution=512, total=1234.567)
+    result = BenchResult({}, 2, 3, 1000, "bunny.ply", [ModelResult("bunny.onnx", "", [exact, sampled])])
+    table = io.StringIO()
+    print_result(result, Console(file=table, width=80))
+    assert "marching cubes 512^3  1234.567   0.23  3.0 GiB  11,315,704   1.2e-16  0.00012" in table.getvalue()
 
 
 def test_slabs_give_the_triangles_of_the_whole_grid(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
 
@@ -22,7 +23,8 @@ def print_result(result: BenchResult, console: Console) -> None:
 
 def _table(result: BenchResult, model: ModelResult) -> Table:
     with_recall = any(entry.soft_recall is not None for entry in model.measurements)
-    table = Table(title=f"{model.model}, {result.threads} threads, median of {result.repeat}", title_justify="left")
+    title = f"{model.model}, {result.threads} threads, median of {result.repeat}"
+    table = Table(title=title, title_justify="left", box=SIMPLE_HEAD, pad_edge=False, collapse_padding=True)
     heads = ["method", "seconds", "ratio", "memory", "triangles", "mean |f|"]
     for head in [*heads, "recall"] if with_recall else heads:
         table.add_column(head, justify="left" if head == "method" else "right", no_wrap=True)
