@@ -229,8 +229,8 @@ def _add_field(parser: argparse.ArgumentParser) -> None:
         "--budget",
         type=float,
         metavar="N",
-        help="most polygons; without tolerance or knots surrogates are as fine as it allows (default 2.5e6, up to 1.2e7 "
-        "where the topology needs them)",
+        help="most polygons; without tolerance or knots surrogates are as fine as it allows (default 2.5e6, up to "
+        "1.2e7 where the topology needs them)",
     )
 
 
