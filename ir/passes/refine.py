@@ -22,8 +22,8 @@ AIM = 0.7
 LEAST_FACTOR = 2.0**-10
 # Two rounds that gain less than this have met a limit that knots do not move.
 LEAST_GAIN = 0.95
-# Of a round's proof: several rounds with more knots reach the tolerance sooner than one with more boxes.
-ROUND_WORK = DEFAULT_WORK / 4
+# Of a round's proof: four times as many boxes halve the knots, and the polygons go with the square of those.
+ROUND_WORK = DEFAULT_WORK
 
 
 class ToleranceNotReached(ValueError):
