@@ -95,7 +95,7 @@ class Projection:
     def of(cls, surface: Surface, field: TrueField, lower: Floats, upper: Floats) -> Projection:
         """The vertices of ``surface`` where they are."""
         values, gradients = field.values_and_gradients(surface.vertices)
-        slope = float(np.median(np.sqrt((gradients**2).sum(axis=1)))) if len(values) else 0.0
+        slope = float(np.median(_lengths(gradients))) if len(values) else 0.0
         return cls(field, lower, upper, surface.vertices.copy(), values, gradients, free_axes(surface), slope)
 
     @property
@@ -132,7 +132,7 @@ class Projection:
         """Move ``vertices``, whose values and gradients are up to date, onto the level set, as far as they find it."""
         start = self.positions[vertices]
         least = SHALLOW * self.slope
-        steepness = np.sqrt(((self.gradients[vertices] * self.free[vertices]) ** 2).sum(axis=1))
+        steepness = _lengths(self.gradients[vertices] * self.free[vertices])
         reach = REACH * np.abs(self.values[vertices]) / np.maximum(steepness, max(least, np.finfo(np.float64).tiny))
         share = np.ones(len(vertices))
         fast = np.zeros(len(vertices), bool)
@@ -155,10 +155,10 @@ class Projection:
         # A vertex that meets a face of the box goes on along it.
         out = np.where((before > 0)[:, None], directions, -directions)
         directions[((positions <= self.lower) & (out > 0)) | ((positions >= self.upper) & (out < 0))] = 0.0
-        squares = (directions**2).sum(axis=1)
+        squares = _lengths(directions) ** 2
         factor = share[places] * before / np.where(squares > 0, squares, np.inf)
         moves = positions - factor[:, None] * directions - start
-        lengths = np.sqrt((moves**2).sum(axis=1))
+        lengths = _lengths(moves)
         moves *= np.minimum(1.0, reach / np.where(lengths > 0, lengths, 1.0))[:, None]
         positions = np.clip(start + moves, self.lower, self.upper)
         if with_gradients:
@@ -172,6 +172,10 @@ class Projection:
             self.gradients[moved] = gradients[better]
             share[places] = np.where(better, 1.0, SHORTENING * share[places])
         fast[places] = np.abs(values) <= FAST * np.abs(before)
+
+
+def _lengths(vectors: Floats) -> Floats:
+    return np.asarray(np.sqrt(np.einsum("ij,ij->i", vectors, vectors)))
 
 
 def free_axes(surface: Surface) -> Booleans:

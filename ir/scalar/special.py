@@ -35,7 +35,9 @@ def _compiled() -> ModuleType:
 
 def _wave(x: Floats, quarters: int, library: Callable[[Floats], Floats]) -> Floats:
     values = np.asarray(x, np.float64)
-    if values.size <= SMALL or not np.abs(values).max() <= _compiled().LARGEST_ARGUMENT:
+    if values.size <= SMALL:
+        return library(values)
+    if not max(-values.min(), values.max()) <= _compiled().LARGEST_ARGUMENT:
         return library(values)
     result: Floats = _compiled().wave(values, quarters)
     return result
