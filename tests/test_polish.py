@@ -18,6 +18,7 @@ from mn_onnx.extraction import extract
 from mn_onnx.ir.evaluate import evaluate, gradient
 from mn_onnx.ir.network import AffineRow, Network
 from mn_onnx.model import Model, load
+from mn_onnx.surrogates import certified, topology_notes
 
 ONLY_VERTICES = np.inf
 
@@ -125,6 +126,16 @@ def test_a_coarse_sine_network_is_polished_without_turning_faces() -> None:
     assert (facing(canonical.network, moved)[upright] >= 0).all()
     assert result.mean_abs_f < 0.05 * result.mean_abs_f_before
     assert check_invariants(moved).problems() == []
+
+
+def test_topology_that_is_only_the_surrogates_is_told(before: Surface) -> None:
+    """Surrogates so coarse that some polygons face away from the true gradient, against fine ones."""
+    canonical, surface = extracted(dense([8, 6], SINE, seed=4), knots=2.0, lower=0.4 * LOW, upper=0.4 * HIGH)
+    _, certificate = certified(surface, canonical, threads=1)
+    assert certificate["turned_share"] > 0
+    (note,) = topology_notes(certificate)
+    assert f"about {certificate['turned_share']:.2g} of the area" in note
+    assert topology_notes(before.report) == []
 
 
 def test_what_is_not_near_the_level_set_is_told(model: Model, before: Surface) -> None:
