@@ -28,7 +28,7 @@ from mn_onnx.extract.kernels.memory import (
     system_ints,
 )
 from mn_onnx.extract.kernels.records import Tables
-from mn_onnx.ir.network import Network
+from mn_onnx.ir.network import KnotTable, Network
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -45,6 +45,7 @@ class Packed(NamedTuple):
     root: int
     rows: int
     cols: int
+    levels: int
 
 
 def pack(network: Network, lower: Floats, upper: Floats) -> Packed:
@@ -70,6 +71,7 @@ def pack(network: Network, lower: Floats, upper: Floats) -> Packed:
         system_i.size,
         int(system_i[SYS_ROWS]),
         int(system_i[SYS_COLS]),
+        int(system_i[SYS_LEVELS]),
     )
 
 
@@ -108,7 +110,17 @@ def _pack_tables(network: Network, order: Integers, extent: float) -> Tables:
         tag_hash,
         n_knots,
         extent,
+        _two_pieces(tables),
     )
+
+
+def _two_pieces(tables: list[KnotTable]) -> Floats:
+    lines = np.zeros((len(tables), 8))
+    for line, table in zip(lines, tables, strict=True):
+        if table.slopes.shape == (1, 2):
+            (left, right), (left_at, right_at) = table.slopes[0], table.intercepts[0]
+            line[:6] = table.knots[0], left, left_at, right, right_at, 1.0
+    return lines
 
 
 def _pack_system(network: Network, order: Integers) -> tuple[Floats, Integers]:

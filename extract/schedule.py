@@ -15,6 +15,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from mn_onnx.extract.kernels import control as entries
 from mn_onnx.extract.kernels import march as kernel
 from mn_onnx.extract.kernels.memory import (
     CELL_END_F,
@@ -25,7 +26,10 @@ from mn_onnx.extract.kernels.memory import (
     J_REGIONS,
     SYS_FLOATS,
     SYS_INTS,
+    TRIMMED_DEPTHS,
     X_REGIONS,
+    first_trim_tag,
+    symbol_stride,
 )
 from mn_onnx.extract.kernels.records import OutputArrays, WorkerArrays
 from mn_onnx.extract.pack import Packed, pack
@@ -46,7 +50,7 @@ class TraversalStatistics:
 
     nodes: int = 0
     pruned: int = 0
-    children_pruned: int = 0
+    trimmed: int = 0
     leaves: int = 0
     folds: int = 0
     broken_cuts: int = 0
@@ -89,14 +93,14 @@ class _Worker:
     """Owns arenas, and runs one task at a time."""
 
     def __init__(self, packed: Packed) -> None:
-        largest = max(packed.rows, packed.cols) + 8
+        largest = max(packed.rows, symbol_stride(packed.cols, packed.levels)) + 8
         self.packed = packed
         self.F = np.empty(max(1 << 16, 2 * packed.F.size))
         self.N = np.empty(max(1 << 16, 2 * packed.N.size), np.int64)
-        self.control = np.zeros(kernel.CONTROL_SIZE, np.int64)
-        self.control[kernel.LEAF_CHOICES] = LEAF_CHOICES
+        self.control = np.zeros(entries.CONTROL_SIZE, np.int64)
+        self.control[entries.LEAF_CHOICES] = LEAF_CHOICES
         self.stack = np.zeros(1024, np.int64)
-        self.slot_of_tag = np.zeros(packed.tables.tag_hash.shape[0], np.int64)
+        self.slot_of_tag = np.zeros(first_trim_tag(packed.tables.n_knots) + 2 * TRIMMED_DEPTHS, np.int64)
         self._set_scratch(max(512, -(-largest // 4) * 4))
         self._set_output(BUFFER_CORNERS // 4, BUFFER_CORNERS)
         self.polygons = self.corners = 0
@@ -120,8 +124,8 @@ class _Worker:
         self.F[: task.F.size] = task.F
         self.N[: task.N.size] = task.N
         self.stack[0] = task.root
-        self.control[kernel.STACK_BOTTOM] = 0
-        self.control[kernel.STACK_TOP] = 1
+        self.control[entries.STACK_BOTTOM] = 0
+        self.control[entries.STACK_TOP] = 1
 
     def _reserve(self, floats: int, integers: int) -> None:
         if floats > self.F.size:
@@ -162,24 +166,24 @@ class _Worker:
             if status == kernel.BUDGET_USED:
                 return False
             if status == kernel.ARENA_FULL:
-                self._reserve(int(self.control[kernel.NEED_F]), int(self.control[kernel.NEED_I]))
+                self._reserve(int(self.control[entries.NEED_F]), int(self.control[entries.NEED_I]))
             elif status == kernel.SCRATCH_FULL:
-                self._set_scratch(-(-2 * int(self.control[kernel.NEED_I]) // 4) * 4)
+                self._set_scratch(-(-2 * int(self.control[entries.NEED_I]) // 4) * 4)
             elif status == kernel.STACK_FULL:
                 self.stack = np.concatenate([self.stack, np.zeros_like(self.stack)])
             else:
                 self.flush(task)
-                polygons, corners = int(self.control[kernel.NEED_POLYGONS]), int(self.control[kernel.NEED_CORNERS])
+                polygons, corners = int(self.control[entries.NEED_POLYGONS]), int(self.control[entries.NEED_CORNERS])
                 if polygons > self.output.sizes.size or corners > self.output.keys.shape[0]:
                     self._set_output(2 * polygons, 2 * corners)
 
     def give_away(self) -> _Task | None:
         """Take the bottom cell off the stack as a task of its own, if at least one other cell remains."""
-        bottom, top = int(self.control[kernel.STACK_BOTTOM]), int(self.control[kernel.STACK_TOP])
+        bottom, top = int(self.control[entries.STACK_BOTTOM]), int(self.control[entries.STACK_TOP])
         if top - bottom < 2:
             return None
         cell = int(self.stack[bottom])
-        self.control[kernel.STACK_BOTTOM] += 1
+        self.control[entries.STACK_BOTTOM] += 1
         header = self.N[cell : cell + CELL_END_I + 1]
         system_f, system_i = int(header[CELL_SYSTEM_F]), int(header[CELL_SYSTEM_I])
         floats, integers = int(self.N[system_i + SYS_FLOATS]), int(self.N[system_i + SYS_INTS])
@@ -270,7 +274,7 @@ def traverse(
 
     def report() -> None:
         if progress is not None:
-            nodes = sum(int(worker.control[kernel.NODES]) for worker in workers)
+            nodes = sum(int(worker.control[entries.NODES]) for worker in workers)
             polygons = sum(worker.polygons + int(worker.output.counts[0]) for worker in workers)
             corners = sum(worker.corners + int(worker.output.counts[1]) for worker in workers)
             progress(Progress(nodes, polygons, corners))
@@ -284,7 +288,7 @@ def traverse(
             report()
     finally:
         for worker in workers:
-            worker.control[kernel.STOP] = 1
+            worker.control[entries.STOP] = 1
         for thread in crew:
             thread.join()
     if pool.error is not None:
@@ -298,16 +302,16 @@ def _statistics(workers: list[_Worker], pool: _Pool) -> TraversalStatistics:
         return sum(int(worker.control[entry]) for worker in workers)
 
     return TraversalStatistics(
-        nodes=total(kernel.NODES),
-        pruned=total(kernel.PRUNED),
-        children_pruned=total(kernel.CHILDREN_PRUNED),
-        leaves=total(kernel.LEAVES),
-        folds=total(kernel.FOLDS),
-        broken_cuts=total(kernel.BROKEN_CUTS),
-        deepest=max(int(worker.control[kernel.DEEPEST]) for worker in workers),
+        nodes=total(entries.NODES),
+        pruned=total(entries.PRUNED),
+        trimmed=total(entries.TRIMMED),
+        leaves=total(entries.LEAVES),
+        folds=total(entries.FOLDS),
+        broken_cuts=total(entries.BROKEN_CUTS),
+        deepest=max(int(worker.control[entries.DEEPEST]) for worker in workers),
         subtrees=pool.subtrees,
         threads=len(workers),
-        profile=np.sum([worker.control[kernel.PROFILE :] for worker in workers], axis=0).reshape(2, -1),
+        profile=np.sum([worker.control[entries.PROFILE :] for worker in workers], axis=0).reshape(2, -1),
     )
 
 

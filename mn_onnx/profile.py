@@ -56,8 +56,8 @@ def profile_text(report: Mapping[str, Any]) -> str:
     lines += [
         "",
         f"cells {traversal['nodes']:,}: pruned {traversal['pruned'] / nodes:.1%}, "
-        f"leaves {traversal['leaves'] / nodes:.1%}, halves pruned {traversal['children_pruned']:,}, "
-        f"folds {traversal['folds']:,}",
+        f"trimmed {traversal['trimmed'] / nodes:.1%}, "
+        f"leaves {traversal['leaves'] / nodes:.1%}, folds {traversal['folds']:,}",
         f"polygons {polygons:,}, cells per polygon {traversal['nodes'] / max(polygons, 1):.2f}, "
         f"deepest {traversal['deepest']}, subtrees {traversal['subtrees']}, threads {traversal['threads']}",
     ]

@@ -1,7 +1,7 @@
 """Bounds of every unit and of the output over a cell, and the states that follow from them.
 
 Each pre-activation is enclosed by a linear centre and a radius, ``|t - c(x)| <= r``, evaluated at the cell's own
-vertices (a linear function is extreme there). A unit of several pieces is relaxed by its chord over the range of ``t``.
+vertices (a linear function is extreme there), and units of several pieces are relaxed (`relax`).
 The output is bounded by a backward pass over the same chords, as in CROWN (Zhang et al., NeurIPS 2018).
 """
 
@@ -9,7 +9,20 @@ from __future__ import annotations
 
 from numba import njit
 
-from mn_onnx.extract.kernels.lanes import fma, lane, larger, load, magnitude, smaller, splat, store
+from mn_onnx.extract.kernels.error_symbols import pass_errors_on, track_errors
+from mn_onnx.extract.kernels.lanes import (
+    fma,
+    lane,
+    larger,
+    load,
+    load_wide,
+    magnitude,
+    smaller,
+    splat,
+    splat_wide,
+    store,
+    total,
+)
 from mn_onnx.extract.kernels.memory import (
     CELL_CAPACITY,
     CELL_FLOATS,
@@ -17,8 +30,11 @@ from mn_onnx.extract.kernels.memory import (
     CENTRE_AT,
     DEAD,
     ERROR,
+    GROWTH,
     HIGH,
     KIND,
+    LEVEL_OUTPUT,
+    LEVEL_SYMBOL,
     LINEAR,
     LOW,
     OFFSET,
@@ -27,19 +43,17 @@ from mn_onnx.extract.kernels.memory import (
     RADIUS,
     READ_AT,
     READ_COLS,
+    READ_ROW,
     SLOPE,
-    STATE_HIGH,
-    STATE_LOW,
     SYS_COLS,
     SYS_HEADER,
     SYS_LEVELS,
     SYS_ROWS,
     UNSTABLE,
     padded,
+    symbol_stride,
 )
-
-# Rounding of a bound, relative to the magnitude of what was summed: 2^-40 is about 4000 units in the last place.
-MARGIN = 2.0**-40
+from mn_onnx.extract.kernels.relax import settle
 
 
 @njit(cache=True, error_model="numpy")
@@ -62,110 +76,56 @@ def row_extremes(F, N, X, M, cell, begin, end):
 
 
 @njit(cache=True, error_model="numpy")
-def relax_piece_range(knots, slopes, intercepts, knot, piece, first, last, low, high):
-    """Relax a table's pieces ``first..last``, more than one, by their chord over [low, high].
-
-    Returns slope, offset and error with ``|y - slope t - offset| <= error``.
-    """
-    at_low = slopes[piece + first] * low + intercepts[piece + first]
-    at_high = slopes[piece + last] * high + intercepts[piece + last]
-    slope = (at_high - at_low) / (high - low)
-    above, below = 0.0, 0.0
-    for s in range(first, last):
-        kappa = knots[knot + s]
-        deviation = slopes[piece + s] * kappa + intercepts[piece + s] - (at_low + slope * (kappa - low))
-        above = max(above, deviation)
-        below = min(below, deviation)
-    return slope, at_low - slope * low + 0.5 * (above + below), 0.5 * (above - below)
-
-
-@njit(cache=True, error_model="numpy")
-def settle_row(N, X, J, M, tables, cols, r, unit):
-    """Tighten the state range of row ``r`` by its bounds and relax its outputs.
-
-    Sets STATE_LOW, STATE_HIGH of the row and SLOPE, OFFSET, ERROR of its columns.
-    """
-    knot, knots = tables.first_knot[unit], tables.knots
-    pieces = tables.first_knot[unit + 1] - knot + 1
-    first, last = J[STATE_LOW * M + r], J[STATE_HIGH * M + r]
-    low, high = X[LOW * M + r], X[HIGH * M + r]
-    if first < last:
-        radius = X[RADIUS * M + r]
-        margin = 0.0
-        if radius > 0.0:
-            low -= radius
-            high += radius
-            size = abs(X[r]) + abs(X[M + r]) + abs(X[2 * M + r]) + abs(X[3 * M + r]) + radius
-            margin = MARGIN * size * tables.extent
-        while first < last and low - margin >= knots[knot + first]:
-            first += 1
-        while last > first and high + margin < knots[knot + last - 1]:
-            last -= 1
-        # A cell that was split here lies on one side of the knot, whatever the radius says.
-        if first > 0 and low < knots[knot + first - 1] < high:
-            low = knots[knot + first - 1]
-        if last < pieces - 1 and low < knots[knot + last] < high:
-            high = knots[knot + last]
-        J[STATE_LOW * M + r] = first
-        J[STATE_HIGH * M + r] = last
-        X[LOW * M + r] = low
-        X[HIGH * M + r] = high
-    piece = tables.first_piece[unit]
-    for c in range(N[cols + r], N[cols + r + 1]):
-        if first == last:
-            X[SLOPE * M + c] = tables.slopes[piece + first]
-            X[OFFSET * M + c] = tables.intercepts[piece + first]
-            X[ERROR * M + c] = 0.0
-        else:
-            slope, offset, error = relax_piece_range(
-                knots, tables.slopes, tables.intercepts, knot, piece, first, last, low, high
-            )
-            X[SLOPE * M + c] = slope
-            X[OFFSET * M + c] = offset
-            X[ERROR * M + c] = error
-        piece += pieces
-
-
-@njit(cache=True, error_model="numpy")
 def remember_outputs(N, X, J, M, row_col, rows, r, count):
     """Append the relaxed outputs of row ``r`` that are not identically zero to the list that later rows read.
 
-    Entry ``p``: J[READ_COLS] the column, J[READ_AT] where its weights begin, and five numbers at ``X[OUTPUTS] + 8 p``:
-    the affine form and the half width of y. Returns the new length of the list.
+    Entry ``p``: J[READ_COLS] the column, J[READ_ROW] its row, J[READ_AT] where its weights begin, and five numbers at
+    ``X[OUTPUTS] + 8 p``: the affine form and the half width of y. Returns the new length of the list.
     """
     for c in range(N[row_col + r], N[row_col + r + 1]):
         slope, offset, error = X[SLOPE * M + c], X[OFFSET * M + c], X[ERROR * M + c]
-        if slope != 0.0 or offset != 0.0 or error != 0.0:
-            J[READ_COLS * M + count] = c
-            J[READ_AT * M + count] = c * rows
-            at = OUTPUTS * M + 8 * count
-            X[at] = slope * X[r]
-            X[at + 1] = slope * X[M + r]
-            X[at + 2] = slope * X[2 * M + r]
-            X[at + 3] = slope * X[3 * M + r] + offset
-            X[at + 4] = abs(slope) * X[RADIUS * M + r] + error
-            count += 1
+        J[READ_COLS * M + count] = c
+        J[READ_ROW * M + count] = r
+        J[READ_AT * M + count] = c * rows
+        at = OUTPUTS * M + 8 * count
+        X[at] = slope * X[r]
+        X[at + 1] = slope * X[M + r]
+        X[at + 2] = slope * X[2 * M + r]
+        X[at + 3] = slope * X[3 * M + r] + offset
+        X[at + 4] = abs(slope) * X[GROWTH * M + r] + error
+        # The next output takes the place of one that is identically zero.
+        count += (slope != 0.0) | (offset != 0.0) | (error != 0.0)
     return count
 
 
 @njit(cache=True, error_model="numpy")
 def read_outputs(F, X, J, M, floats, rows, begin, end, first, count):
-    """Centres and radii of rows ``begin:end``: their affine parts plus what they read of outputs ``first:count``."""
+    """Centres of rows ``begin:end``: their affine parts plus what they read of outputs ``first:count``.
+
+    Also X[GROWTH], radii that add up whatever the rows read.
+    """
     weights = floats + 4 * rows
     outputs = OUTPUTS * M
     places = READ_AT * M
     r = begin
-    while r + 8 <= end:
-        c0, c1 = load(F, floats + r), load(F, floats + rows + r)
-        c2, c3 = load(F, floats + 2 * rows + r), load(F, floats + 3 * rows + r)
-        d0, d1 = load(F, floats + r + 4), load(F, floats + rows + r + 4)
-        d2, d3 = load(F, floats + 2 * rows + r + 4), load(F, floats + 3 * rows + r + 4)
-        c4, d4 = splat(0.0), splat(0.0)
+    while r + 16 <= end:
+        s = r + 8
+        c0, c1 = load_wide(F, floats + r), load_wide(F, floats + rows + r)
+        c2, c3 = load_wide(F, floats + 2 * rows + r), load_wide(F, floats + 3 * rows + r)
+        d0, d1 = load_wide(F, floats + s), load_wide(F, floats + rows + s)
+        d2, d3 = load_wide(F, floats + 2 * rows + s), load_wide(F, floats + 3 * rows + s)
+        c4, d4 = splat_wide(0.0), splat_wide(0.0)
         for p in range(first, count):
             at = weights + J[places + p] + r
-            w, v = load(F, at), load(F, at + 4)
+            w, v = load_wide(F, at), load_wide(F, at + 8)
             y = outputs + 8 * p
-            y0, y1, y2, y3, y4 = splat(X[y]), splat(X[y + 1]), splat(X[y + 2]), splat(X[y + 3]), splat(X[y + 4])
+            y0, y1, y2, y3, y4 = (
+                splat_wide(X[y]),
+                splat_wide(X[y + 1]),
+                splat_wide(X[y + 2]),
+                splat_wide(X[y + 3]),
+                splat_wide(X[y + 4]),
+            )
             c0, d0 = fma(w, y0, c0), fma(v, y0, d0)
             c1, d1 = fma(w, y1, c1), fma(v, y1, d1)
             c2, d2 = fma(w, y2, c2), fma(v, y2, d2)
@@ -175,12 +135,30 @@ def read_outputs(F, X, J, M, floats, rows, begin, end, first, count):
         store(X, M + r, c1)
         store(X, 2 * M + r, c2)
         store(X, 3 * M + r, c3)
-        store(X, RADIUS * M + r, c4)
-        store(X, r + 4, d0)
-        store(X, M + r + 4, d1)
-        store(X, 2 * M + r + 4, d2)
-        store(X, 3 * M + r + 4, d3)
-        store(X, RADIUS * M + r + 4, d4)
+        store(X, GROWTH * M + r, c4)
+        store(X, s, d0)
+        store(X, M + s, d1)
+        store(X, 2 * M + s, d2)
+        store(X, 3 * M + s, d3)
+        store(X, GROWTH * M + s, d4)
+        r += 16
+    if r + 8 <= end:
+        c0, c1 = load_wide(F, floats + r), load_wide(F, floats + rows + r)
+        c2, c3 = load_wide(F, floats + 2 * rows + r), load_wide(F, floats + 3 * rows + r)
+        c4 = splat_wide(0.0)
+        for p in range(first, count):
+            w = load_wide(F, weights + J[places + p] + r)
+            y = outputs + 8 * p
+            c0 = fma(w, splat_wide(X[y]), c0)
+            c1 = fma(w, splat_wide(X[y + 1]), c1)
+            c2 = fma(w, splat_wide(X[y + 2]), c2)
+            c3 = fma(w, splat_wide(X[y + 3]), c3)
+            c4 = fma(magnitude(w), splat_wide(X[y + 4]), c4)
+        store(X, r, c0)
+        store(X, M + r, c1)
+        store(X, 2 * M + r, c2)
+        store(X, 3 * M + r, c3)
+        store(X, GROWTH * M + r, c4)
         r += 8
     if r < end:
         c0, c1 = load(F, floats + r), load(F, floats + rows + r)
@@ -198,21 +176,26 @@ def read_outputs(F, X, J, M, floats, rows, begin, end, first, count):
         store(X, M + r, c1)
         store(X, 2 * M + r, c2)
         store(X, 3 * M + r, c3)
-        store(X, RADIUS * M + r, radius)
+        store(X, GROWTH * M + r, radius)
 
 
 @njit(cache=True, error_model="numpy")
-def bound_units(F, N, X, J, M, tables, cell, system, floats):
+def bound_units(F, N, X, J, M, tables, cell, system, floats, scratch, tracked):
     """Forward pass: bounds, states and relaxations of all rows of the system over the cell.
 
-    Reads the row states in J (STATE_LOW, STATE_HIGH) and narrows them, and sets the rows' KIND. Returns the numbers of
-    settled rows whose output is not identically zero (LINEAR), and whose is (DEAD).
+    Reads the row states in J (STATE_LOW, STATE_HIGH) and narrows them, and sets the rows' KIND. If ``tracked``, radii
+    come from `error_symbols`, whose tables begin at F[scratch]. Returns the numbers of settled rows whose output is not
+    identically zero (LINEAR), and whose is (DEAD).
     """
     rows, cols, levels = N[system + SYS_ROWS], N[system + SYS_COLS], N[system + SYS_LEVELS]
     level_start = system + SYS_HEADER
     row_unit = level_start + levels + 1
     row_col = row_unit + rows
     col_end = row_col + rows + 1 + 2 * cols
+    weights = floats + 4 * rows
+    stride = symbol_stride(cols, levels)
+    errors, carried = scratch, scratch + rows * stride
+    J[LEVEL_OUTPUT * M] = J[LEVEL_SYMBOL * M] = 0
     first, count, linear, dead = 0, 0, 0, 0
     for level in range(levels):
         begin, end = N[level_start + level], N[level_start + level + 1]
@@ -220,22 +203,40 @@ def bound_units(F, N, X, J, M, tables, cell, system, floats):
         while first < count and N[col_end + J[READ_COLS * M + first]] <= begin:
             first += 1
         read_outputs(F, X, J, M, floats, rows, begin, end, first, count)
+        if tracked:
+            track_errors(F, X, J, M, weights, begin, end, level, first, count, errors, carried, stride)
+        else:
+            for r in range(begin, end, 4):
+                store(X, RADIUS * M + r, load(X, GROWTH * M + r))
         row_extremes(F, N, X, M, cell, begin, end)
+        before = count
         for r in range(begin, end):
-            unit = N[row_unit + r]
-            if unit < 0:
-                continue
-            settle_row(N, X, J, M, tables, row_col, r, unit)
-            before = count
-            count = remember_outputs(N, X, J, M, row_col, rows, r, count)
-            if J[STATE_LOW * M + r] < J[STATE_HIGH * M + r]:
-                J[KIND * M + r] = UNSTABLE
-            elif count > before:
-                J[KIND * M + r] = LINEAR
-                linear += 1
-            else:
-                J[KIND * M + r] = DEAD
-                dead += 1
+            if N[row_unit + r] >= 0:
+                kind = settle(N, X, J, M, tables, row_col, r, N[row_unit + r])
+                linear += kind == LINEAR
+                dead += kind == DEAD
+                count = remember_outputs(N, X, J, M, row_col, rows, r, count)
+        if tracked:
+            pass_errors_on(F, X, J, M, level, before, count, errors, carried, stride)
+    return linear, dead
+
+
+@njit(cache=True, error_model="numpy")
+def settle_again(F, N, X, J, M, tables, cell, system):
+    """After a cell has been trimmed: settle its unstable rows by the centres and radii they had on the whole cell.
+
+    Returns how many rows have become LINEAR, and how many DEAD.
+    """
+    rows = N[system + SYS_ROWS]
+    row_unit = system + SYS_HEADER + N[system + SYS_LEVELS] + 1
+    row_col = row_unit + rows
+    row_extremes(F, N, X, M, cell, 0, rows)
+    linear, dead = 0, 0
+    for r in range(rows):
+        if N[row_unit + r] >= 0 and J[KIND * M + r] == UNSTABLE:
+            kind = settle(N, X, J, M, tables, row_col, r, N[row_unit + r])
+            linear += kind == LINEAR
+            dead += kind == DEAD
     return linear, dead
 
 
@@ -256,10 +257,17 @@ def bound_output(F, N, X, M, system, floats):
     radius, constant = 0.0, 0.0
     for c in range(cols - 1, -1, -1):
         begin, end = N[col_begin + c], N[col_end + c]
-        total = zero
-        for q in range(begin, end, 4):
-            total = fma(load(X, multiplier + q), load(F, weights + c * rows + q), total)
-        coefficient = F[out_weights + c] + ((lane(total, 0) + lane(total, 1)) + (lane(total, 2) + lane(total, 3)))
+        column = weights + c * rows
+        even, odd, rest = splat_wide(0.0), splat_wide(0.0), zero
+        q = begin
+        while q + 16 <= end:
+            even = fma(load_wide(X, multiplier + q), load_wide(F, column + q), even)
+            odd = fma(load_wide(X, multiplier + q + 8), load_wide(F, column + q + 8), odd)
+            q += 16
+        while q < end:
+            rest = fma(load(X, multiplier + q), load(F, column + q), rest)
+            q += 4
+        coefficient = F[out_weights + c] + ((total(even) + total(odd)) + total(rest))
         X[multiplier + N[col_row + c]] += coefficient * X[SLOPE * M + c]
         constant += coefficient * X[OFFSET * M + c]
         radius += abs(coefficient) * X[ERROR * M + c]
@@ -272,10 +280,10 @@ def bound_output(F, N, X, M, system, floats):
         s3 = fma(m, load(F, floats + 3 * rows + r), s3)
     out = out_weights + padded(cols)
     at = CENTRE_AT * M
-    X[at] = F[out] + ((lane(s0, 0) + lane(s0, 1)) + (lane(s0, 2) + lane(s0, 3)))
-    X[at + 1] = F[out + 1] + ((lane(s1, 0) + lane(s1, 1)) + (lane(s1, 2) + lane(s1, 3)))
-    X[at + 2] = F[out + 2] + ((lane(s2, 0) + lane(s2, 1)) + (lane(s2, 2) + lane(s2, 3)))
-    X[at + 3] = F[out + 3] + constant + ((lane(s3, 0) + lane(s3, 1)) + (lane(s3, 2) + lane(s3, 3)))
+    X[at] = F[out] + total(s0)
+    X[at + 1] = F[out + 1] + total(s1)
+    X[at + 2] = F[out + 2] + total(s2)
+    X[at + 3] = F[out + 3] + constant + total(s3)
     return radius
 
 

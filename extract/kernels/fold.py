@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from numba import njit
 
-from mn_onnx.extract.kernels.lanes import fma, load, splat, store
+from mn_onnx.extract.kernels.lanes import splat, store
 from mn_onnx.extract.kernels.memory import (
     KEPT_ROWS,
     KIND,
@@ -33,6 +33,7 @@ from mn_onnx.extract.kernels.memory import (
     system_floats,
     system_ints,
 )
+from mn_onnx.extract.kernels.products import accumulate, accumulate_four
 
 
 @njit(cache=True, error_model="numpy")
@@ -183,55 +184,6 @@ def gather_column(F, J, M, source, begin, rows, target):
     kept = KEPT_ROWS * M
     for q in range(begin, rows):
         F[target + q] = F[source + J[kept + q]]
-
-
-@njit(cache=True, error_model="numpy")
-def accumulate(F, target, begin, end, rows, gathered, first, count, coefficients, stride):
-    """F[target + q] += sum_p F[coefficients + p * stride] * F[gathered + p * rows + q].
-
-    Over rows ``begin <= q < end`` and settled columns ``first <= p < count``.
-    """
-    for q in range(begin, end, 4):
-        a = load(F, target + q)
-        source = gathered + first * rows + q
-        for p in range(first, count):
-            a = fma(splat(F[coefficients + p * stride]), load(F, source), a)
-            source += rows
-        store(F, target + q, a)
-
-
-@njit(cache=True, error_model="numpy")
-def accumulate_four(F, target, begin, rows, gathered, first, count, coefficients, stride):
-    """`accumulate` for four targets, ``rows`` apart, whose coefficients are neighbours: a register tile of 4 x 8."""
-    q = begin
-    if (rows - q) & 7:
-        for k in range(4):
-            accumulate(F, target + k * rows, q, q + 4, rows, gathered, first, count, coefficients + k, stride)
-        q += 4
-    while q < rows:
-        t0, t1, t2, t3 = target + q, target + rows + q, target + 2 * rows + q, target + 3 * rows + q
-        a0, b0, a1, b1 = load(F, t0), load(F, t0 + 4), load(F, t1), load(F, t1 + 4)
-        a2, b2, a3, b3 = load(F, t2), load(F, t2 + 4), load(F, t3), load(F, t3 + 4)
-        source = gathered + first * rows + q
-        at = coefficients + first * stride
-        for _ in range(first, count):
-            u, v = load(F, source), load(F, source + 4)
-            w0, w1, w2, w3 = splat(F[at]), splat(F[at + 1]), splat(F[at + 2]), splat(F[at + 3])
-            a0, b0 = fma(w0, u, a0), fma(w0, v, b0)
-            a1, b1 = fma(w1, u, a1), fma(w1, v, b1)
-            a2, b2 = fma(w2, u, a2), fma(w2, v, b2)
-            a3, b3 = fma(w3, u, a3), fma(w3, v, b3)
-            source += rows
-            at += stride
-        store(F, t0, a0)
-        store(F, t0 + 4, b0)
-        store(F, t1, a1)
-        store(F, t1 + 4, b1)
-        store(F, t2, a2)
-        store(F, t2 + 4, b2)
-        store(F, t3, a3)
-        store(F, t3 + 4, b3)
-        q += 8
 
 
 @njit(cache=True, error_model="numpy")

@@ -1,10 +1,10 @@
-"""Four float64 values in one vector register, for compiled kernels.
+"""Four or eight float64 values in one vector register, for compiled kernels.
 
 LLVM's loop vectoriser guards every short loop over arrays with run-time alias checks, which cost more than loops of
 four to thirty steps gain. Here the vector operations are written out, so that a kernel's inner loop is exactly its
-loads and fused multiply-adds. Every machine LLVM knows can run them; one without 256-bit registers splits them.
+loads and fused multiply-adds. Every machine LLVM knows can run them; one without registers this wide splits them.
 
-`load` and `store` are unaligned and unchecked: callers pad to a multiple of `WIDTH`.
+`load`, `load_wide` and `store` are unaligned and unchecked: callers pad to a multiple of `WIDTH`.
 """
 
 from __future__ import annotations
@@ -17,34 +17,42 @@ from numba.core import cgutils
 from numba.extending import intrinsic, models, register_model
 
 WIDTH = 4
+WIDE = 8
 
-_VECTOR = ir.VectorType(ir.DoubleType(), WIDTH)
+_INT32 = ir.IntType(32)
 
 
 class LanesType(types.Type):
-    """The numba type of a vector of `WIDTH` float64."""
+    """The numba type of a vector of ``width`` float64."""
 
-    def __init__(self) -> None:
-        super().__init__(name="Lanes")
+    def __init__(self, width: int) -> None:
+        super().__init__(name=f"Lanes{width}")
+        self.vector = ir.VectorType(ir.DoubleType(), width)
 
 
-lanes = LanesType()
+lanes = LanesType(WIDTH)
+wide_lanes = LanesType(WIDE)
 
 
 @register_model(LanesType)
 class _LanesModel(models.PrimitiveModel):
-    def __init__(self, manager: Any, numba_type: Any) -> None:
-        super().__init__(manager, numba_type, _VECTOR)
+    def __init__(self, manager: Any, numba_type: LanesType) -> None:
+        super().__init__(manager, numba_type, numba_type.vector)
 
 
-def _vector_pointer(builder: Any, pointer: Any, index: Any) -> Any:
-    return builder.bitcast(builder.gep(pointer, [index]), _VECTOR.as_pointer())
+def _vector_pointer(builder: Any, vector: Any, pointer: Any, index: Any) -> Any:
+    return builder.bitcast(builder.gep(pointer, [index]), vector.as_pointer())
 
 
-def _call(builder: Any, name: str, arguments: list[Any]) -> Any:
-    signature = ir.FunctionType(_VECTOR, [_VECTOR] * len(arguments))
-    function = cgutils.get_or_insert_function(builder.module, signature, f"llvm.{name}.v{WIDTH}f64")
+def _call(builder: Any, name: str, vector: Any, arguments: list[Any]) -> Any:
+    signature = ir.FunctionType(vector, [vector] * len(arguments))
+    function = cgutils.get_or_insert_function(builder.module, signature, f"llvm.{name}.v{vector.count}f64")
     return builder.call(function, arguments)
+
+
+def _shuffle(builder: Any, vector: Any, order: list[int]) -> Any:
+    mask = ir.Constant(ir.VectorType(_INT32, len(order)), order)
+    return builder.shuffle_vector(vector, ir.Constant(vector.type, ir.Undefined), mask)
 
 
 @intrinsic
@@ -64,36 +72,47 @@ def pointer(typing_context: Any, array: Any) -> Any:
 @intrinsic
 def load(typing_context: Any, source: Any, index: Any) -> Any:
     """``source[index : index + WIDTH]`` through a pointer."""
+    return lanes(source, types.int64), _load
 
-    def code(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        return builder.load(_vector_pointer(builder, *arguments), align=8)
 
-    return lanes(source, types.int64), code
+@intrinsic
+def load_wide(typing_context: Any, source: Any, index: Any) -> Any:
+    """``source[index : index + WIDE]`` through a pointer."""
+    return wide_lanes(source, types.int64), _load
+
+
+def _load(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+    return builder.load(_vector_pointer(builder, signature.return_type.vector, *arguments), align=8)
 
 
 @intrinsic
 def store(typing_context: Any, target: Any, index: Any, value: Any) -> Any:
-    """``target[index : index + WIDTH] = value`` through a pointer."""
+    """``target[index : index + width] = value`` through a pointer."""
 
     def code(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        builder.store(arguments[2], _vector_pointer(builder, arguments[0], arguments[1]), align=8)
+        target, index, value = arguments
+        builder.store(value, _vector_pointer(builder, value.type, target, index), align=8)
         return context.get_dummy_value()
 
-    return types.none(target, types.int64, lanes), code
+    return types.none(target, types.int64, value), code
 
 
 @intrinsic
 def splat(typing_context: Any, value: Any) -> Any:
-    """The same number in every lane."""
+    """The same number in `WIDTH` lanes."""
+    return lanes(types.float64), _splat
 
-    def code(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        undefined = ir.Constant(_VECTOR, ir.Undefined)
-        zero = ir.Constant(ir.IntType(32), 0)
-        first = builder.insert_element(undefined, arguments[0], zero)
-        order = ir.Constant(ir.VectorType(ir.IntType(32), WIDTH), [0] * WIDTH)
-        return builder.shuffle_vector(first, undefined, order)
 
-    return lanes(types.float64), code
+@intrinsic
+def splat_wide(typing_context: Any, value: Any) -> Any:
+    """The same number in `WIDE` lanes."""
+    return wide_lanes(types.float64), _splat
+
+
+def _splat(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+    vector = signature.return_type.vector
+    first = builder.insert_element(ir.Constant(vector, ir.Undefined), arguments[0], ir.Constant(_INT32, 0))
+    return _shuffle(builder, first, [0] * vector.count)
 
 
 @intrinsic
@@ -101,9 +120,9 @@ def fma(typing_context: Any, a: Any, b: Any, c: Any) -> Any:
     """``a * b + c``, fused where the machine can."""
 
     def code(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        return _call(builder, "fmuladd", list(arguments))
+        return _call(builder, "fmuladd", arguments[0].type, list(arguments))
 
-    return lanes(lanes, lanes, lanes), code
+    return a(a, a, a), code
 
 
 @intrinsic
@@ -113,7 +132,7 @@ def smaller(typing_context: Any, a: Any, b: Any) -> Any:
     def code(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         return builder.select(builder.fcmp_ordered("<", *arguments), *arguments)
 
-    return lanes(lanes, lanes), code
+    return a(a, a), code
 
 
 @intrinsic
@@ -123,7 +142,7 @@ def larger(typing_context: Any, a: Any, b: Any) -> Any:
     def code(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         return builder.select(builder.fcmp_ordered(">", *arguments), *arguments)
 
-    return lanes(lanes, lanes), code
+    return a(a, a), code
 
 
 @intrinsic
@@ -131,9 +150,25 @@ def magnitude(typing_context: Any, a: Any) -> Any:
     """``|a|``."""
 
     def code(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        return _call(builder, "fabs", list(arguments))
+        return _call(builder, "fabs", arguments[0].type, list(arguments))
 
-    return lanes(lanes), code
+    return a(a), code
+
+
+@intrinsic
+def total(typing_context: Any, a: Any) -> Any:
+    """The sum of the lanes, added in pairs."""
+
+    def code(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        vector = arguments[0]
+        while vector.type.count > 2:
+            half = vector.type.count // 2
+            low = _shuffle(builder, vector, list(range(half)))
+            vector = builder.fadd(low, _shuffle(builder, vector, list(range(half, 2 * half))))
+        ends = [builder.extract_element(vector, ir.Constant(_INT32, k)) for k in range(2)]
+        return builder.fadd(*ends)
+
+    return types.float64(a), code
 
 
 @intrinsic
@@ -141,9 +176,9 @@ def lane(typing_context: Any, value: Any, index: Any) -> Any:
     """One lane as a float64."""
 
     def code(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        return builder.extract_element(arguments[0], builder.trunc(arguments[1], ir.IntType(32)))
+        return builder.extract_element(arguments[0], builder.trunc(arguments[1], _INT32))
 
-    return types.float64(lanes, types.int64), code
+    return types.float64(value, types.int64), code
 
 
 @intrinsic

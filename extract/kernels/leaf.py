@@ -29,6 +29,7 @@ from mn_onnx.extract.kernels.memory import (
     TAGS_A,
     TAGS_B,
     VALUES,
+    first_trim_tag,
     padded,
 )
 from mn_onnx.extract.kernels.polytope import (
@@ -111,7 +112,7 @@ def substitute_output(F, N, X, J, M, system, floats, tables, target):
 def emit_choice(F, N, X, J, M, output, tables, slot_of_tag, cell, cell_rows, system, floats):
     """Emit the polygon of the chosen states, if the surface has one there.
 
-    Returns 1 if the cell is too degenerate to be cut, else 0.
+    Returns 1 if the cell is too degenerate to be cut, or the polygon reaches a plane that trimmed the cell, else 0.
     """
     rows = N[system + SYS_ROWS]
     row_unit = system + SYS_HEADER + N[system + SYS_LEVELS] + 1
@@ -149,6 +150,9 @@ def emit_choice(F, N, X, J, M, output, tables, slot_of_tag, cell, cell_rows, sys
             if count == 0:
                 return 0
             polygon, tags, other, other_tags = other, other_tags, polygon, tags
+    for j in range(count):
+        if J[tags * M + j] >= first_trim_tag(tables.n_knots):
+            return 1
     emit_polygon(X, J, M, output, tables, count, polygon, tags, hash0, hash1, gradient)
     return 0
 

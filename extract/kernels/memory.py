@@ -18,7 +18,8 @@ of the lane width, ``cols`` outputs of these units, and the hash of the states o
 
 A vertex lies on three planes, listed counter-clockwise seen from outside; ``neighbours[3 * v + i]`` is the other end of
 the edge that lies on the two planes other than ``i``. A plane's *tag* is twice its index, plus one when the cell is on
-its upper side; box faces come after the knots and have even tags only.
+its upper side; box faces come after the knots and have even tags only. Then come the tags of the planes that cells were
+trimmed by, two for every depth up to `TRIMMED_DEPTHS`: the surface never reaches those.
 """
 
 from __future__ import annotations
@@ -34,17 +35,22 @@ CELL_END_F, CELL_END_I, CELL_DEPTH, CELL_HEADER = 5, 6, 7, 8
 (CENTRE, RADIUS, LOW, HIGH, SLOPE, OFFSET, ERROR, OUT_COEF, VALUES, OUT_VALUES) = (0, 4, 5, 6, 7, 8, 9, 10, 11, 12)
 (POLY_A, POLY_B, POLY_VALUES, CUT_X, CUT_Y, CUT_Z, CENTRE_AT, FORMS) = (13, 16, 19, 20, 21, 22, 23, 24)
 OUTPUTS = 28  # eight
-CUT_SHARE = 36
-X_REGIONS = 37
+CUT_SHARE, GROWTH, SYMBOL_ERROR = 36, 37, 38
+X_REGIONS = 39
 
 # Scratch regions of J.
 (STATE_LOW, STATE_HIGH, NEW_INDEX, CUT_OUT, CUT_IN, CUT_NEXT, CUT_PREVIOUS, CUT_FROM) = (0, 1, 2, 3, 4, 5, 6, 7)
 (TAGS_A, TAGS_B, CUT_TO, KEPT_ROWS, STABLE_COLS, CHOICE, CHOICE_FIRST, CHOICE_LAST) = (8, 9, 10, 11, 12, 13, 14, 15)
 (READ_COLS, READ_AT, KIND, BELOW, ABOVE, SIDE_COUNTS) = (16, 17, 18, 19, 20, 21)
-J_REGIONS = 22
+(SYMBOL_AT, LEVEL_OUTPUT, LEVEL_SYMBOL, READ_ROW) = (22, 23, 24, 25)
+J_REGIONS = 26
 
 # Kinds of rows: settled with output zero, settled, neither.
 DEAD, LINEAR, UNSTABLE = 0, 1, 2
+
+
+# Cells deeper than this are not trimmed.
+TRIMMED_DEPTHS = 1024
 
 
 @njit(cache=True, error_model="numpy")
@@ -69,3 +75,15 @@ def system_floats(rows: int, cols: int) -> int:
 def cell_ints(rows: int, vertices: int) -> int:
     """Number of int64 a cell takes."""
     return CELL_HEADER + 2 * rows + 6 * vertices
+
+
+@njit(cache=True, error_model="numpy")
+def symbol_stride(cols: int, levels: int) -> int:
+    """Room for the error symbols of a system: one a column, padded level by level to the lane width."""
+    return padded(cols) + 4 * levels
+
+
+@njit(cache=True, error_model="numpy")
+def first_trim_tag(n_knots: int) -> int:
+    """The tags of planes that trimmed a cell start here, after the knots and six box faces."""
+    return 2 * (n_knots + 6)

@@ -233,3 +233,19 @@ def clip_polygon(X, J, M, count, polygon, tags, result, result_tags, a0, a1, a2,
             J[result_tags * M + out] = tag if here_in else J[tags * M + j]
             out += 1
     return out
+
+
+@njit(cache=True, error_model="numpy")
+def copy_polytope(F, N, cell, rows, new_rows, copy, copy_floats):
+    """Write a cell's polytope again at ``copy`` (N) and ``copy_floats`` (F), for a system of ``new_rows`` rows.
+
+    The caller fills the rest of the header and the states. Returns the number of vertices.
+    """
+    n, capacity, x = N[cell + CELL_VERTICES], N[cell + CELL_CAPACITY], N[cell + CELL_FLOATS]
+    N[copy + CELL_VERTICES], N[copy + CELL_CAPACITY], N[copy + CELL_FLOATS] = n, capacity, copy_floats
+    for v in range(3 * capacity):
+        F[copy_floats + v] = F[x + v]
+    source, target = cell + CELL_HEADER + 2 * rows, copy + CELL_HEADER + 2 * new_rows
+    for i in range(6 * n):
+        N[target + i] = N[source + i]
+    return n

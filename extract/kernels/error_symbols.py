@@ -1,0 +1,176 @@
+"""Radii from every unit's own error, as in zonotopes: errors that reach a row along several ways may cancel.
+
+A radius summed level by level grows with the product of the layers' absolute weights: after eight layers it can be a
+hundred times what this gives. The same forms are in Singh et al., Fast and Effective Robustness Certification (NeurIPS
+2018). An unstable unit's error is a *symbol* in [-1, 1] times X[SYMBOL_ERROR]; every row has a coefficient for each
+symbol before it, and its radius is the sum of their magnitudes. The cost is the cube of the number of units, so this is
+for deep systems only, and not for every cell.
+"""
+
+from __future__ import annotations
+
+from numba import njit
+
+from mn_onnx.extract.kernels.lanes import fma, load, load_wide, magnitude, splat, splat_wide, store, total
+from mn_onnx.extract.kernels.memory import (
+    ERROR,
+    GROWTH,
+    LEVEL_OUTPUT,
+    LEVEL_SYMBOL,
+    RADIUS,
+    READ_AT,
+    READ_COLS,
+    READ_ROW,
+    SLOPE,
+    SYMBOL_AT,
+    SYMBOL_ERROR,
+    symbol_stride,
+)
+from mn_onnx.extract.kernels.relax import MARGIN
+
+
+@njit(cache=True, error_model="numpy")
+def carry_errors(F, J, M, target, stride, begin, end, carried, first, count, weights):
+    """Errors ``begin:end`` of four rows from ``target`` on: add what they read through outputs ``first:count``."""
+    places = READ_AT * M
+    s = begin
+    while s + 16 <= end:
+        t0 = target + s
+        t1 = t0 + stride
+        t2 = t1 + stride
+        t3 = t2 + stride
+        a0, a1, a2, a3 = load_wide(F, t0), load_wide(F, t1), load_wide(F, t2), load_wide(F, t3)
+        b0, b1, b2, b3 = load_wide(F, t0 + 8), load_wide(F, t1 + 8), load_wide(F, t2 + 8), load_wide(F, t3 + 8)
+        source = carried + first * stride + s
+        for p in range(first, count):
+            at = weights + J[places + p]
+            u, v = load_wide(F, source), load_wide(F, source + 8)
+            w0, w1, w2, w3 = splat_wide(F[at]), splat_wide(F[at + 1]), splat_wide(F[at + 2]), splat_wide(F[at + 3])
+            a0, b0 = fma(w0, u, a0), fma(w0, v, b0)
+            a1, b1 = fma(w1, u, a1), fma(w1, v, b1)
+            a2, b2 = fma(w2, u, a2), fma(w2, v, b2)
+            a3, b3 = fma(w3, u, a3), fma(w3, v, b3)
+            source += stride
+        store(F, t0, a0)
+        store(F, t1, a1)
+        store(F, t2, a2)
+        store(F, t3, a3)
+        store(F, t0 + 8, b0)
+        store(F, t1 + 8, b1)
+        store(F, t2 + 8, b2)
+        store(F, t3 + 8, b3)
+        s += 16
+    if s + 8 <= end:
+        t0 = target + s
+        t1 = t0 + stride
+        t2 = t1 + stride
+        t3 = t2 + stride
+        a0, a1, a2, a3 = load_wide(F, t0), load_wide(F, t1), load_wide(F, t2), load_wide(F, t3)
+        source = carried + first * stride + s
+        for p in range(first, count):
+            at = weights + J[places + p]
+            u = load_wide(F, source)
+            a0 = fma(splat_wide(F[at]), u, a0)
+            a1 = fma(splat_wide(F[at + 1]), u, a1)
+            a2 = fma(splat_wide(F[at + 2]), u, a2)
+            a3 = fma(splat_wide(F[at + 3]), u, a3)
+            source += stride
+        store(F, t0, a0)
+        store(F, t1, a1)
+        store(F, t2, a2)
+        store(F, t3, a3)
+        s += 8
+    if s < end:
+        t0 = target + s
+        t1 = t0 + stride
+        t2 = t1 + stride
+        t3 = t2 + stride
+        a0, a1, a2, a3 = load(F, t0), load(F, t1), load(F, t2), load(F, t3)
+        source = carried + first * stride + s
+        for p in range(first, count):
+            at = weights + J[places + p]
+            u = load(F, source)
+            a0 = fma(splat(F[at]), u, a0)
+            a1 = fma(splat(F[at + 1]), u, a1)
+            a2 = fma(splat(F[at + 2]), u, a2)
+            a3 = fma(splat(F[at + 3]), u, a3)
+            source += stride
+        store(F, t0, a0)
+        store(F, t1, a1)
+        store(F, t2, a2)
+        store(F, t3, a3)
+
+
+@njit(cache=True, error_model="numpy")
+def start_errors(F, X, J, M, weights, target, stride, begin, symbols):
+    """The errors that four rows read directly: from symbol ``begin`` on each unit's own; no row reads those before."""
+    for k in range(4):
+        for s in range(begin):
+            F[target + k * stride + s] = 0.0
+    for s in range(begin, symbols):
+        error = X[SYMBOL_ERROR * M + s]
+        at = weights + J[SYMBOL_AT * M + s]
+        for k in range(4):
+            F[target + k * stride + s] = error * F[at + k]
+
+
+@njit(cache=True, error_model="numpy")
+def sum_errors(F, X, M, target, row, symbols):
+    """X[RADIUS] of a row: the sum of its errors' magnitudes, with their rounding, at most X[GROWTH]."""
+    one, summed = splat(1.0), splat(0.0)
+    for s in range(0, symbols, 4):
+        summed = fma(one, magnitude(load(F, target + s)), summed)
+    growth = X[GROWTH * M + row]
+    X[RADIUS * M + row] = min(growth, total(summed) + MARGIN * growth)
+
+
+@njit(cache=True, error_model="numpy")
+def track_errors(F, X, J, M, weights, begin, end, level, first, count, errors, carried, stride):
+    """Radii of rows ``begin:end`` of a level from the error of every single unit before.
+
+    ``weights``: F's index of the columns. ``first:count``: the outputs that the rows read. The rows' table of errors
+    starts at F[errors], the outputs' at F[carried], ``stride`` numbers for each row or output.
+    """
+    symbols = J[LEVEL_SYMBOL * M + level]
+    # Errors of levels whose outputs no row reads any more come through other outputs only.
+    own = 0
+    while own < level and J[LEVEL_OUTPUT * M + own + 1] <= first:
+        own += 1
+    for r in range(begin, end, 4):
+        target = errors + r * stride
+        start_errors(F, X, J, M, weights + r, target, stride, J[LEVEL_SYMBOL * M + own], symbols)
+        for earlier in range(level - 1):
+            start, stop = J[LEVEL_SYMBOL * M + earlier], J[LEVEL_SYMBOL * M + earlier + 1]
+            if start < stop:
+                since = max(first, J[LEVEL_OUTPUT * M + earlier + 1])
+                carry_errors(F, J, M, target, stride, start, stop, carried, since, count, weights + r)
+        for k in range(4):
+            sum_errors(F, X, M, target + k * stride, r + k, symbols)
+
+
+@njit(cache=True, error_model="numpy")
+def pass_errors_on(F, X, J, M, level, begin, end, errors, carried, stride):
+    """The table of errors of outputs ``begin:end`` of a level, and a symbol for each that has an error of its own."""
+    known = J[LEVEL_SYMBOL * M + level]
+    symbols = known
+    for p in range(begin, end):
+        c = J[READ_COLS * M + p]
+        slope, zero = splat(X[SLOPE * M + c]), splat(0.0)
+        source, target = errors + J[READ_ROW * M + p] * stride, carried + p * stride
+        for s in range(0, known, 4):
+            store(F, target + s, fma(slope, load(F, source + s), zero))
+        X[SYMBOL_ERROR * M + symbols] = X[ERROR * M + c]
+        J[SYMBOL_AT * M + symbols] = J[READ_AT * M + p]
+        symbols += X[ERROR * M + c] > 0.0
+    while symbols & 3:
+        X[SYMBOL_ERROR * M + symbols] = 0.0
+        J[SYMBOL_AT * M + symbols] = J[SYMBOL_AT * M + symbols - 1]
+        symbols += 1
+    J[LEVEL_OUTPUT * M + level + 1] = end
+    J[LEVEL_SYMBOL * M + level + 1] = symbols
+
+
+@njit(cache=True, error_model="numpy")
+def tracking_floats(rows, cols, levels):
+    """Number of float64 that the tables of errors of a system take in scratch."""
+    return (rows + cols) * symbol_stride(cols, levels)

@@ -1,0 +1,118 @@
+"""Products of dense matrices in the arenas, in register tiles as wide as the levels of a system allow."""
+
+from __future__ import annotations
+
+from numba import njit
+
+from mn_onnx.extract.kernels.lanes import fma, load, load_wide, splat, splat_wide, store
+
+
+@njit(cache=True, error_model="numpy")
+def accumulate(F, target, begin, end, rows, gathered, first, count, coefficients, stride):
+    """F[target + q] += sum_p F[coefficients + p * stride] * F[gathered + p * rows + q].
+
+    Over rows ``begin <= q < end`` and settled columns ``first <= p < count``.
+    """
+    q = begin
+    while q + 32 <= end:
+        t = target + q
+        a, b, c, d = load_wide(F, t), load_wide(F, t + 8), load_wide(F, t + 16), load_wide(F, t + 24)
+        source = gathered + first * rows + q
+        at = coefficients + first * stride
+        for _ in range(first, count):
+            w = splat_wide(F[at])
+            a = fma(w, load_wide(F, source), a)
+            b = fma(w, load_wide(F, source + 8), b)
+            c = fma(w, load_wide(F, source + 16), c)
+            d = fma(w, load_wide(F, source + 24), d)
+            source += rows
+            at += stride
+        store(F, t, a)
+        store(F, t + 8, b)
+        store(F, t + 16, c)
+        store(F, t + 24, d)
+        q += 32
+    while q + 8 <= end:
+        a = load_wide(F, target + q)
+        source = gathered + first * rows + q
+        at = coefficients + first * stride
+        for _ in range(first, count):
+            a = fma(splat_wide(F[at]), load_wide(F, source), a)
+            source += rows
+            at += stride
+        store(F, target + q, a)
+        q += 8
+    if q < end:
+        e = load(F, target + q)
+        source = gathered + first * rows + q
+        at = coefficients + first * stride
+        for _ in range(first, count):
+            e = fma(splat(F[at]), load(F, source), e)
+            source += rows
+            at += stride
+        store(F, target + q, e)
+
+
+@njit(cache=True, error_model="numpy")
+def accumulate_four(F, target, begin, rows, gathered, first, count, coefficients, stride):
+    """`accumulate` for four targets, ``rows`` apart, whose coefficients are neighbours: register tiles of 4 x 16."""
+    q = begin
+    while q + 16 <= rows:
+        t0, t1, t2, t3 = target + q, target + rows + q, target + 2 * rows + q, target + 3 * rows + q
+        a0, a1, a2, a3 = load_wide(F, t0), load_wide(F, t1), load_wide(F, t2), load_wide(F, t3)
+        b0, b1, b2, b3 = load_wide(F, t0 + 8), load_wide(F, t1 + 8), load_wide(F, t2 + 8), load_wide(F, t3 + 8)
+        source = gathered + first * rows + q
+        at = coefficients + first * stride
+        for _ in range(first, count):
+            u, v = load_wide(F, source), load_wide(F, source + 8)
+            w0, w1, w2, w3 = splat_wide(F[at]), splat_wide(F[at + 1]), splat_wide(F[at + 2]), splat_wide(F[at + 3])
+            a0, b0 = fma(w0, u, a0), fma(w0, v, b0)
+            a1, b1 = fma(w1, u, a1), fma(w1, v, b1)
+            a2, b2 = fma(w2, u, a2), fma(w2, v, b2)
+            a3, b3 = fma(w3, u, a3), fma(w3, v, b3)
+            source += rows
+            at += stride
+        store(F, t0, a0)
+        store(F, t1, a1)
+        store(F, t2, a2)
+        store(F, t3, a3)
+        store(F, t0 + 8, b0)
+        store(F, t1 + 8, b1)
+        store(F, t2 + 8, b2)
+        store(F, t3 + 8, b3)
+        q += 16
+    if q + 8 <= rows:
+        t0, t1, t2, t3 = target + q, target + rows + q, target + 2 * rows + q, target + 3 * rows + q
+        a0, a1, a2, a3 = load_wide(F, t0), load_wide(F, t1), load_wide(F, t2), load_wide(F, t3)
+        source = gathered + first * rows + q
+        at = coefficients + first * stride
+        for _ in range(first, count):
+            u = load_wide(F, source)
+            a0 = fma(splat_wide(F[at]), u, a0)
+            a1 = fma(splat_wide(F[at + 1]), u, a1)
+            a2 = fma(splat_wide(F[at + 2]), u, a2)
+            a3 = fma(splat_wide(F[at + 3]), u, a3)
+            source += rows
+            at += stride
+        store(F, t0, a0)
+        store(F, t1, a1)
+        store(F, t2, a2)
+        store(F, t3, a3)
+        q += 8
+    if q < rows:
+        t0, t1, t2, t3 = target + q, target + rows + q, target + 2 * rows + q, target + 3 * rows + q
+        e0, e1, e2, e3 = load(F, t0), load(F, t1), load(F, t2), load(F, t3)
+        source = gathered + first * rows + q
+        at = coefficients + first * stride
+        for _ in range(first, count):
+            x = load(F, source)
+            e0 = fma(splat(F[at]), x, e0)
+            e1 = fma(splat(F[at + 1]), x, e1)
+            e2 = fma(splat(F[at + 2]), x, e2)
+            e3 = fma(splat(F[at + 3]), x, e3)
+            source += rows
+            at += stride
+        store(F, t0, e0)
+        store(F, t1, e1)
+        store(F, t2, e2)
+        store(F, t3, e3)

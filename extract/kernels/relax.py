@@ -1,0 +1,137 @@
+"""States of units that follow from their bounds, and linear relaxations of the undecided ones.
+
+A unit of several pieces is relaxed by its chord over the range of its pre-activation.
+"""
+
+from __future__ import annotations
+
+from numba import njit
+
+from mn_onnx.extract.kernels.memory import (
+    DEAD,
+    ERROR,
+    HIGH,
+    KIND,
+    LINEAR,
+    LOW,
+    OFFSET,
+    RADIUS,
+    SLOPE,
+    STATE_HIGH,
+    STATE_LOW,
+    UNSTABLE,
+)
+
+# Rounding of a bound, relative to the magnitude of what was summed: 2^-40 is about 4000 units in the last place.
+MARGIN = 2.0**-40
+
+
+@njit(cache=True, error_model="numpy")
+def bound_radius(X, M, extent, r):
+    """The radius of row ``r`` with what rounding may add; exactly 0 for a row that is affine on the cell."""
+    radius = X[RADIUS * M + r]
+    size = abs(X[r]) + abs(X[M + r]) + abs(X[2 * M + r]) + abs(X[3 * M + r]) + radius
+    return radius + MARGIN * size * extent if radius > 0.0 else 0.0
+
+
+@njit(cache=True, error_model="numpy")
+def relax_piece_range(knots, slopes, intercepts, knot, piece, first, last, low, high):
+    """Relax a table's pieces ``first..last``, more than one, by their chord over [low, high].
+
+    Returns slope, offset and error with ``|y - slope t - offset| <= error``.
+    """
+    at_low = slopes[piece + first] * low + intercepts[piece + first]
+    at_high = slopes[piece + last] * high + intercepts[piece + last]
+    slope = (at_high - at_low) / (high - low)
+    above, below = 0.0, 0.0
+    for s in range(first, last):
+        kappa = knots[knot + s]
+        deviation = slopes[piece + s] * kappa + intercepts[piece + s] - (at_low + slope * (kappa - low))
+        above = max(above, deviation)
+        below = min(below, deviation)
+    return slope, at_low - slope * low + 0.5 * (above + below), 0.5 * (above - below)
+
+
+@njit(cache=True, error_model="numpy")
+def settle_row(N, X, J, M, tables, cols, r, unit):
+    """Tighten the state range of row ``r`` by its bounds and relax its outputs.
+
+    Sets STATE_LOW, STATE_HIGH of the row and SLOPE, OFFSET, ERROR of its columns; returns its kind.
+    """
+    knot, knots = tables.first_knot[unit], tables.knots
+    pieces = tables.first_knot[unit + 1] - knot + 1
+    first, last = J[STATE_LOW * M + r], J[STATE_HIGH * M + r]
+    low, high = X[LOW * M + r], X[HIGH * M + r]
+    if first < last:
+        reach = bound_radius(X, M, tables.extent, r)
+        low -= reach
+        high += reach
+        while first < last and low >= knots[knot + first]:
+            first += 1
+        while last > first and high < knots[knot + last - 1]:
+            last -= 1
+        # A cell that was split here lies on one side of the knot, whatever the radius says.
+        if first > 0 and low < knots[knot + first - 1] < high:
+            low = knots[knot + first - 1]
+        if last < pieces - 1 and low < knots[knot + last] < high:
+            high = knots[knot + last]
+        J[STATE_LOW * M + r] = first
+        J[STATE_HIGH * M + r] = last
+        X[LOW * M + r] = low
+        X[HIGH * M + r] = high
+    piece = tables.first_piece[unit]
+    kind = DEAD
+    for c in range(N[cols + r], N[cols + r + 1]):
+        if first == last:
+            slope, offset, error = tables.slopes[piece + first], tables.intercepts[piece + first], 0.0
+            kind = LINEAR if slope != 0.0 or offset != 0.0 else kind
+        else:
+            slope, offset, error = relax_piece_range(
+                knots, tables.slopes, tables.intercepts, knot, piece, first, last, low, high
+            )
+        X[SLOPE * M + c] = slope
+        X[OFFSET * M + c] = offset
+        X[ERROR * M + c] = error
+        piece += pieces
+    return kind if first == last else UNSTABLE
+
+
+@njit(cache=True, error_model="numpy")
+def settle_two_pieces(X, J, M, tables, r, c, unit):
+    """`settle_row` for a unit of one knot and one output, column ``c``, as almost all are: without branches.
+
+    Which way such a unit goes is as good as random, and a branch guessed wrong costs more than all of this.
+    """
+    line = 8 * unit
+    knot, left, left_at = tables.two_pieces[line], tables.two_pieces[line + 1], tables.two_pieces[line + 2]
+    right, right_at = tables.two_pieces[line + 3], tables.two_pieces[line + 4]
+    reach = bound_radius(X, M, tables.extent, r)
+    low, high = X[LOW * M + r] - reach, X[HIGH * M + r] + reach
+    first, last = J[STATE_LOW * M + r], J[STATE_HIGH * M + r]
+    above = (first == 1) | ((last == 1) & (low >= knot))
+    below = (not above) & ((last == 0) | (high < knot))
+    settled = above | below
+    at_low = left * low + left_at
+    chord = (right * high + right_at - at_low) / (high - low)
+    deviation = left * knot + left_at - (at_low + chord * (knot - low))
+    middle = at_low - chord * low + 0.5 * deviation
+    slope = right if above else (left if below else chord)
+    offset = right_at if above else (left_at if below else middle)
+    J[STATE_LOW * M + r] = 1 if above else 0
+    J[STATE_HIGH * M + r] = 0 if below else 1
+    X[SLOPE * M + c] = slope
+    X[OFFSET * M + c] = offset
+    X[ERROR * M + c] = 0.0 if settled else 0.5 * abs(deviation)
+    dead = (slope == 0.0) & (offset == 0.0)
+    return (DEAD if dead else LINEAR) if settled else UNSTABLE
+
+
+@njit(cache=True, error_model="numpy")
+def settle(N, X, J, M, tables, row_col, r, unit):
+    """Tighten the state range of row ``r``, relax its outputs, and set its KIND, which is returned."""
+    if tables.two_pieces[8 * unit + 5] == 1.0:
+        kind = settle_two_pieces(X, J, M, tables, r, N[row_col + r], unit)
+    else:
+        kind = settle_row(N, X, J, M, tables, row_col, r, unit)
+    J[KIND * M + r] = kind
+    return kind
