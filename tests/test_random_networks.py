@@ -32,6 +32,8 @@ NETWORKS = [
     RandomNetwork(3, (("maximum", 4), ("maximum", 4), ("maximum", 3)), False, 9),
     RandomNetwork(3, (("minimum", 4), ("maximum", 4)), True, 10),
     RandomNetwork(3, (("clip", 3), ("abs", 3), ("leaky_relu", 3)), True, 11),
+    RandomNetwork(3, (("relu", 3),) * 6, True, 12),
+    RandomNetwork(3, (("leaky_relu", 3),) * 5, True, 13),
 ]
 SETTINGS = settings(deadline=None, derandomize=True, suppress_health_check=[HealthCheck.too_slow])
 
@@ -69,7 +71,7 @@ def test_network_matches_oracle(body: RandomNetwork) -> None:
 
 
 @pytest.mark.parametrize(
-    ("seed", "layers", "n_outputs"), [(1, (4,), 1), (2, (3, 3), 2), (3, (2, 2, 2), 3), (4, (3, 2), 1)]
+    ("seed", "layers", "n_outputs"), [(1, (4,), 1), (2, (3, 3), 2), (3, (2, 2, 2), 3), (4, (3, 2), 1), (5, (2,) * 5, 2)]
 )
 def test_tables_with_several_knots_and_outputs_match_oracle(seed: int, layers: tuple[int, ...], n_outputs: int) -> None:
     soup = _assert_exact(random_tables(seed, layers, n_knots=4, n_outputs=n_outputs))

@@ -1,0 +1,106 @@
+"""Bounds that the traversal takes of units: they enclose the units, and tracked errors make them tighter."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from ir_networks import dense, naive_values
+from numba import njit
+from numpy.typing import NDArray
+
+from mn_onnx.extract.kernels.bound import bound_units
+from mn_onnx.extract.kernels.error_symbols import tracking_floats
+from mn_onnx.extract.kernels.lanes import pointer
+from mn_onnx.extract.kernels.march import point_at_tables
+from mn_onnx.extract.kernels.memory import (
+    CELL_HEADER,
+    HIGH,
+    J_REGIONS,
+    LOW,
+    RADIUS,
+    STATE_HIGH,
+    STATE_LOW,
+    SYS_HEADER,
+    SYS_ROWS,
+    X_REGIONS,
+    symbol_stride,
+)
+from mn_onnx.extract.pack import Packed, pack
+from mn_onnx.extract.schedule import traverse
+from mn_onnx.ir.network import Network
+from mn_onnx.ir.passes import canonicalize
+from oracle.random_networks import random_tables
+
+Floats = NDArray[np.float64]
+LOWER, UPPER = np.array([0.1, -0.3, 0.2]), np.array([0.3, -0.1, 0.4])
+
+
+@njit  # type: ignore[untyped-decorator]
+def _bound(F: Any, N: Any, X: Any, J: Any, tables: Any, cell: int, scratch: int, tracked: bool) -> None:
+    M = X.size // X_REGIONS
+    rows = N[SYS_ROWS]
+    for r in range(rows):
+        J[STATE_LOW * M + r] = N[cell + CELL_HEADER + r]
+        J[STATE_HIGH * M + r] = N[cell + CELL_HEADER + rows + r]
+    bound_units(
+        pointer(F), pointer(N), pointer(X), pointer(J), M, point_at_tables(tables), cell, 0, 0, scratch, tracked
+    )
+
+
+def _radii(packed: Packed, tracked: bool) -> tuple[Floats, Floats, Floats]:
+    """Lowest and highest centre and the radius of every unit, in the packed order."""
+    room = max(packed.rows, symbol_stride(packed.cols, packed.levels)) + 8
+    X, J = np.zeros(X_REGIONS * room), np.zeros(J_REGIONS * room, np.int64)
+    F = np.concatenate([packed.F, np.zeros(tracking_floats(packed.rows, packed.cols, packed.levels))])
+    _bound(F, packed.N, X, J, packed.tables, packed.root, packed.F.size, tracked)
+    row_unit = packed.N[SYS_HEADER + packed.levels + 1 :][: packed.rows]
+    rows = np.flatnonzero(row_unit >= 0)
+    low, high, radius = (X[region * room :][rows] for region in (LOW, HIGH, RADIUS))
+    return low, high, radius
+
+
+def _pre_activations(network: Network, points: Floats) -> Floats:
+    """[units, n], in the packed order."""
+    order = np.argsort(network.unit_level, kind="stable")
+    return np.stack(
+        [naive_values(Network(3, network.units[: int(g)], network.units[g].row), points, tables=True) for g in order]
+    )
+
+
+@pytest.mark.parametrize("layers", [[12] * 6, [9, 5, 7, 6, 10, 8, 9]], ids=str)
+def test_tracked_errors_enclose_units_more_tightly(layers: list[int]) -> None:
+    network = canonicalize(dense(layers, seed=4), lower=LOWER, upper=UPPER).network
+    packed = pack(network, LOWER, UPPER)
+    low, high, tracked = _radii(packed, True)
+    _, _, summed = _radii(packed, False)
+    points = np.random.default_rng(0).uniform(LOWER, UPPER, (4000, 3))
+    values = _pre_activations(network, points)
+    margin = 1e-12
+    assert np.all(values >= (low - tracked - margin)[:, None])
+    assert np.all(values <= (high + tracked + margin)[:, None])
+    assert np.all(tracked <= summed)
+    assert np.array_equal(tracked == 0.0, summed == 0.0)
+    assert tracked[-3:].max() < 0.5 * summed[-3:].max()
+
+
+def test_tracked_errors_enclose_units_of_several_outputs() -> None:
+    network = random_tables(3, (3, 3, 3, 3, 2), n_knots=4, n_outputs=3)
+    packed = pack(network, LOWER, UPPER)
+    low, high, radius = _radii(packed, True)
+    _, _, summed = _radii(packed, False)
+    values = _pre_activations(network, np.random.default_rng(1).uniform(LOWER, UPPER, (4000, 3)))
+    # Rows of several knots keep their bounds with the radius in LOW and HIGH already.
+    assert np.all(values >= (low - radius - 1e-12)[:, None])
+    assert np.all(values <= (high + radius + 1e-12)[:, None])
+    assert np.all(radius <= summed)
+
+
+def test_most_cells_of_a_curved_surface_are_trimmed() -> None:
+    lower, upper = np.full(3, -1.0), np.full(3, 1.0)
+    network = canonicalize(dense([24, 24], seed=2), lower=lower, upper=upper).network
+    _, statistics = traverse(network, lower, upper, threads=1)
+    assert statistics.nodes > 100
+    assert statistics.trimmed > 0.2 * statistics.nodes
+    assert statistics.broken_cuts == 0
