@@ -17,7 +17,7 @@ from typing import cast
 import numpy as np
 from numpy.typing import NDArray
 
-from mn_onnx.extract.blocks import resolve_threads, run_blocks
+from mn_onnx.extract.blocks import resolve_threads, run_matrix_blocks
 from mn_onnx.extract.kernels.deviation import Tables, advance_errors, corner_ranges, table_values
 from mn_onnx.extract.surface import Surface
 from mn_onnx.ir.bounds import unit_bounds
@@ -90,7 +90,7 @@ def polygon_errors(
             used, rows = np.unique(mine, return_inverse=True)
             errors[begin:end] = bound(vertices[used], rows.reshape(-1), offsets[begin : end + 1] - offsets[begin])
 
-    run_blocks(work, -(-errors.size // size), resolve_threads(threads))
+    run_matrix_blocks(work, -(-errors.size // size), resolve_threads(threads))
     return errors
 
 

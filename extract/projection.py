@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from mn_onnx.extract.blocks import run_blocks
+from mn_onnx.extract.blocks import run_matrix_blocks
 from mn_onnx.extract.edges import half_edge_heads
 from mn_onnx.extract.surface import Surface
 from mn_onnx.ir.evaluator import Evaluator
@@ -59,7 +59,7 @@ class TrueField:
             part = slice(first * BLOCK, last * BLOCK)
             result[part] = self._evaluator.values(points[part])
 
-        run_blocks(work, -(-len(points) // BLOCK), self._threads)
+        run_matrix_blocks(work, -(-len(points) // BLOCK), self._threads)
         return result
 
     def values_and_gradients(self, points: Floats) -> tuple[Floats, Floats]:
@@ -70,7 +70,7 @@ class TrueField:
             part = slice(first * BLOCK, last * BLOCK)
             values[part], gradients[part] = self._evaluator.values_and_gradients(points[part])
 
-        run_blocks(work, -(-len(points) // BLOCK), self._threads)
+        run_matrix_blocks(work, -(-len(points) // BLOCK), self._threads)
         return values, gradients
 
 
