@@ -15,10 +15,12 @@ from mn_onnx.extract.kernels.lanes import (
     lane,
     larger,
     load,
+    load_like,
     load_wide,
     magnitude,
     smaller,
     splat,
+    splat_like,
     splat_wide,
     store,
     total,
@@ -143,40 +145,33 @@ def read_outputs(F, X, J, M, floats, rows, begin, end, first, count):
         store(X, GROWTH * M + s, d4)
         r += 16
     if r + 8 <= end:
-        c0, c1 = load_wide(F, floats + r), load_wide(F, floats + rows + r)
-        c2, c3 = load_wide(F, floats + 2 * rows + r), load_wide(F, floats + 3 * rows + r)
-        c4 = splat_wide(0.0)
-        for p in range(first, count):
-            w = load_wide(F, weights + J[places + p] + r)
-            y = outputs + 8 * p
-            c0 = fma(w, splat_wide(X[y]), c0)
-            c1 = fma(w, splat_wide(X[y + 1]), c1)
-            c2 = fma(w, splat_wide(X[y + 2]), c2)
-            c3 = fma(w, splat_wide(X[y + 3]), c3)
-            c4 = fma(magnitude(w), splat_wide(X[y + 4]), c4)
-        store(X, r, c0)
-        store(X, M + r, c1)
-        store(X, 2 * M + r, c2)
-        store(X, 3 * M + r, c3)
-        store(X, GROWTH * M + r, c4)
+        read_outputs_lanes(splat_wide(0.0), F, X, J, M, floats, rows, r, first, count)
         r += 8
     if r < end:
-        c0, c1 = load(F, floats + r), load(F, floats + rows + r)
-        c2, c3 = load(F, floats + 2 * rows + r), load(F, floats + 3 * rows + r)
-        radius = splat(0.0)
-        for p in range(first, count):
-            w = load(F, weights + J[places + p] + r)
-            y = outputs + 8 * p
-            c0 = fma(w, splat(X[y]), c0)
-            c1 = fma(w, splat(X[y + 1]), c1)
-            c2 = fma(w, splat(X[y + 2]), c2)
-            c3 = fma(w, splat(X[y + 3]), c3)
-            radius = fma(magnitude(w), splat(X[y + 4]), radius)
-        store(X, r, c0)
-        store(X, M + r, c1)
-        store(X, 2 * M + r, c2)
-        store(X, 3 * M + r, c3)
-        store(X, GROWTH * M + r, radius)
+        read_outputs_lanes(splat(0.0), F, X, J, M, floats, rows, r, first, count)
+
+
+@njit(cache=True, error_model="numpy")
+def read_outputs_lanes(like, F, X, J, M, floats, rows, r, first, count):
+    """`read_outputs` for as many rows from ``r`` on as ``like`` has lanes."""
+    outputs, places = OUTPUTS * M, READ_AT * M
+    weights = floats + 4 * rows + r
+    c0, c1 = load_like(like, F, floats + r), load_like(like, F, floats + rows + r)
+    c2, c3 = load_like(like, F, floats + 2 * rows + r), load_like(like, F, floats + 3 * rows + r)
+    growth = splat_like(like, 0.0)
+    for p in range(first, count):
+        w = load_like(like, F, weights + J[places + p])
+        y = outputs + 8 * p
+        c0 = fma(w, splat_like(like, X[y]), c0)
+        c1 = fma(w, splat_like(like, X[y + 1]), c1)
+        c2 = fma(w, splat_like(like, X[y + 2]), c2)
+        c3 = fma(w, splat_like(like, X[y + 3]), c3)
+        growth = fma(magnitude(w), splat_like(like, X[y + 4]), growth)
+    store(X, r, c0)
+    store(X, M + r, c1)
+    store(X, 2 * M + r, c2)
+    store(X, 3 * M + r, c3)
+    store(X, GROWTH * M + r, growth)
 
 
 @njit(cache=True, error_model="numpy")
@@ -195,6 +190,7 @@ def bound_units(F, N, X, J, M, tables, cell, system, floats, scratch, tracked):
     weights = floats + 4 * rows
     stride = symbol_stride(cols, levels)
     errors, carried = scratch, scratch + rows * stride
+    read = carried + cols * stride
     J[LEVEL_OUTPUT * M] = J[LEVEL_SYMBOL * M] = 0
     first, count, linear, dead = 0, 0, 0, 0
     for level in range(levels):
@@ -204,7 +200,7 @@ def bound_units(F, N, X, J, M, tables, cell, system, floats, scratch, tracked):
             first += 1
         read_outputs(F, X, J, M, floats, rows, begin, end, first, count)
         if tracked:
-            track_errors(F, X, J, M, weights, begin, end, level, first, count, errors, carried, stride)
+            track_errors(F, X, J, M, weights, begin, end, level, first, count, errors, carried, stride, read)
         else:
             for r in range(begin, end, 4):
                 store(X, RADIUS * M + r, load(X, GROWTH * M + r))

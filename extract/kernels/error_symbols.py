@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from numba import njit
 
-from mn_onnx.extract.kernels.lanes import fma, load, load_wide, magnitude, splat, splat_wide, store, total
+from mn_onnx.extract.kernels.lanes import fma, load, magnitude, splat, store, total
 from mn_onnx.extract.kernels.memory import (
     ERROR,
     GROWTH,
@@ -26,79 +26,8 @@ from mn_onnx.extract.kernels.memory import (
     SYMBOL_ERROR,
     symbol_stride,
 )
+from mn_onnx.extract.kernels.products import accumulate_four
 from mn_onnx.extract.kernels.relax import MARGIN
-
-
-@njit(cache=True, error_model="numpy")
-def carry_errors(F, J, M, target, stride, begin, end, carried, first, count, weights):
-    """Errors ``begin:end`` of four rows from ``target`` on: add what they read through outputs ``first:count``."""
-    places = READ_AT * M
-    s = begin
-    while s + 16 <= end:
-        t0 = target + s
-        t1 = t0 + stride
-        t2 = t1 + stride
-        t3 = t2 + stride
-        a0, a1, a2, a3 = load_wide(F, t0), load_wide(F, t1), load_wide(F, t2), load_wide(F, t3)
-        b0, b1, b2, b3 = load_wide(F, t0 + 8), load_wide(F, t1 + 8), load_wide(F, t2 + 8), load_wide(F, t3 + 8)
-        source = carried + first * stride + s
-        for p in range(first, count):
-            at = weights + J[places + p]
-            u, v = load_wide(F, source), load_wide(F, source + 8)
-            w0, w1, w2, w3 = splat_wide(F[at]), splat_wide(F[at + 1]), splat_wide(F[at + 2]), splat_wide(F[at + 3])
-            a0, b0 = fma(w0, u, a0), fma(w0, v, b0)
-            a1, b1 = fma(w1, u, a1), fma(w1, v, b1)
-            a2, b2 = fma(w2, u, a2), fma(w2, v, b2)
-            a3, b3 = fma(w3, u, a3), fma(w3, v, b3)
-            source += stride
-        store(F, t0, a0)
-        store(F, t1, a1)
-        store(F, t2, a2)
-        store(F, t3, a3)
-        store(F, t0 + 8, b0)
-        store(F, t1 + 8, b1)
-        store(F, t2 + 8, b2)
-        store(F, t3 + 8, b3)
-        s += 16
-    if s + 8 <= end:
-        t0 = target + s
-        t1 = t0 + stride
-        t2 = t1 + stride
-        t3 = t2 + stride
-        a0, a1, a2, a3 = load_wide(F, t0), load_wide(F, t1), load_wide(F, t2), load_wide(F, t3)
-        source = carried + first * stride + s
-        for p in range(first, count):
-            at = weights + J[places + p]
-            u = load_wide(F, source)
-            a0 = fma(splat_wide(F[at]), u, a0)
-            a1 = fma(splat_wide(F[at + 1]), u, a1)
-            a2 = fma(splat_wide(F[at + 2]), u, a2)
-            a3 = fma(splat_wide(F[at + 3]), u, a3)
-            source += stride
-        store(F, t0, a0)
-        store(F, t1, a1)
-        store(F, t2, a2)
-        store(F, t3, a3)
-        s += 8
-    if s < end:
-        t0 = target + s
-        t1 = t0 + stride
-        t2 = t1 + stride
-        t3 = t2 + stride
-        a0, a1, a2, a3 = load(F, t0), load(F, t1), load(F, t2), load(F, t3)
-        source = carried + first * stride + s
-        for p in range(first, count):
-            at = weights + J[places + p]
-            u = load(F, source)
-            a0 = fma(splat(F[at]), u, a0)
-            a1 = fma(splat(F[at + 1]), u, a1)
-            a2 = fma(splat(F[at + 2]), u, a2)
-            a3 = fma(splat(F[at + 3]), u, a3)
-            source += stride
-        store(F, t0, a0)
-        store(F, t1, a1)
-        store(F, t2, a2)
-        store(F, t3, a3)
 
 
 @njit(cache=True, error_model="numpy")
@@ -125,11 +54,12 @@ def sum_errors(F, X, M, target, row, symbols):
 
 
 @njit(cache=True, error_model="numpy")
-def track_errors(F, X, J, M, weights, begin, end, level, first, count, errors, carried, stride):
+def track_errors(F, X, J, M, weights, begin, end, level, first, count, errors, carried, stride, read):
     """Radii of rows ``begin:end`` of a level from the error of every single unit before.
 
     ``weights``: F's index of the columns. ``first:count``: the outputs that the rows read. The rows' table of errors
-    starts at F[errors], the outputs' at F[carried], ``stride`` numbers for each row or output.
+    starts at F[errors], the outputs' at F[carried], ``stride`` numbers for each row or output; F[read] is scratch of
+    four numbers an output.
     """
     symbols = J[LEVEL_SYMBOL * M + level]
     # Errors of levels whose outputs no row reads any more come through other outputs only.
@@ -138,12 +68,14 @@ def track_errors(F, X, J, M, weights, begin, end, level, first, count, errors, c
         own += 1
     for r in range(begin, end, 4):
         target = errors + r * stride
+        for p in range(first, count):
+            store(F, read + 4 * p, load(F, weights + J[READ_AT * M + p] + r))
         start_errors(F, X, J, M, weights + r, target, stride, J[LEVEL_SYMBOL * M + own], symbols)
         for earlier in range(level - 1):
             start, stop = J[LEVEL_SYMBOL * M + earlier], J[LEVEL_SYMBOL * M + earlier + 1]
             if start < stop:
                 since = max(first, J[LEVEL_OUTPUT * M + earlier + 1])
-                carry_errors(F, J, M, target, stride, start, stop, carried, since, count, weights + r)
+                accumulate_four(F, target, start, stop, stride, carried, since, count, read, 4)
         for k in range(4):
             sum_errors(F, X, M, target + k * stride, r + k, symbols)
 
@@ -173,4 +105,4 @@ def pass_errors_on(F, X, J, M, level, begin, end, errors, carried, stride):
 @njit(cache=True, error_model="numpy")
 def tracking_floats(rows, cols, levels):
     """Number of float64 that the tables of errors of a system take in scratch."""
-    return (rows + cols) * symbol_stride(cols, levels)
+    return (rows + cols) * symbol_stride(cols, levels) + 4 * cols

@@ -170,7 +170,7 @@ def express_settled_rows(F, N, X, J, M, system, floats, settled, new_cols, folde
                 F[target + p] = X[SLOPE * M + c] * F[source + N[col_row + c]]
         p = first
         while p + 4 <= last:
-            accumulate_four(F, work + p * stride, 0, stride, work, 0, first, scratch + p - first, width)
+            accumulate_four(F, work + p * stride, 0, stride, stride, work, 0, first, scratch + p - first, width)
             p += 4
         while p < last:
             accumulate(F, work + p * stride, 0, stride, stride, work, 0, first, scratch + p - first, width)
@@ -200,7 +200,7 @@ def multiply_settled(F, N, J, M, folded, weights, gathered, settled, work, strid
             first += 1
         begin = N[col_begin + k]
         if k + 4 <= cols and N[col_begin + k + 3] == begin:
-            accumulate_four(F, weights + k * rows, begin, rows, gathered, first, settled, work + k, stride)
+            accumulate_four(F, weights + k * rows, begin, rows, rows, gathered, first, settled, work + k, stride)
             k += 4
         else:
             accumulate(F, weights + k * rows, begin, rows, rows, gathered, first, settled, work + k, stride)
@@ -239,7 +239,7 @@ def fold(F, N, X, J, M, system, floats, folded, folded_floats, least):
     for axis in range(4):
         target = folded_floats + axis * new_rows
         gather_column(F, J, M, floats + axis * rows, 0, new_rows, target)
-    accumulate_four(F, folded_floats, 0, new_rows, gathered, 0, settled, work + affine, stride)
+    accumulate_four(F, folded_floats, 0, new_rows, new_rows, gathered, 0, settled, work + affine, stride)
     new_weights = folded_floats + 4 * new_rows
     new_out = new_weights + new_cols * new_rows
     out_weights = weights + cols * rows

@@ -4,7 +4,7 @@ LLVM's loop vectoriser guards every short loop over arrays with run-time alias c
 four to thirty steps gain. Here the vector operations are written out, so that a kernel's inner loop is exactly its
 loads and fused multiply-adds. Every machine LLVM knows can run them; one without registers this wide splits them.
 
-`load`, `load_wide` and `store` are unaligned and unchecked: callers pad to a multiple of `WIDTH`.
+Loads and stores are unaligned and unchecked: callers pad to a multiple of `WIDTH`.
 """
 
 from __future__ import annotations
@@ -81,6 +81,16 @@ def load_wide(typing_context: Any, source: Any, index: Any) -> Any:
     return wide_lanes(source, types.int64), _load
 
 
+@intrinsic
+def load_like(typing_context: Any, like: Any, source: Any, index: Any) -> Any:
+    """As many values of ``source`` from ``index`` on as ``like`` has lanes: for kernels of either width."""
+
+    def code(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        return _load(context, builder, signature, arguments[1:])
+
+    return like(like, source, types.int64), code
+
+
 def _load(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
     return builder.load(_vector_pointer(builder, signature.return_type.vector, *arguments), align=8)
 
@@ -107,6 +117,16 @@ def splat(typing_context: Any, value: Any) -> Any:
 def splat_wide(typing_context: Any, value: Any) -> Any:
     """The same number in `WIDE` lanes."""
     return wide_lanes(types.float64), _splat
+
+
+@intrinsic
+def splat_like(typing_context: Any, like: Any, value: Any) -> Any:
+    """The same number in as many lanes as ``like`` has."""
+
+    def code(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        return _splat(context, builder, signature, arguments[1:])
+
+    return like(like, types.float64), code
 
 
 def _splat(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from numba import njit
 
-from mn_onnx.extract.kernels.lanes import fma, load, load_wide, splat, splat_wide, store
+from mn_onnx.extract.kernels.lanes import fma, load_like, load_wide, splat, splat_like, splat_wide, store
 
 
 @njit(cache=True, error_model="numpy")
 def accumulate(F, target, begin, end, rows, gathered, first, count, coefficients, stride):
     """F[target + q] += sum_p F[coefficients + p * stride] * F[gathered + p * rows + q].
 
-    Over rows ``begin <= q < end`` and settled columns ``first <= p < count``.
+    Over ``begin <= q < end``, a multiple of four, and ``first <= p < count``.
     """
     q = begin
     while q + 32 <= end:
@@ -33,31 +33,30 @@ def accumulate(F, target, begin, end, rows, gathered, first, count, coefficients
         store(F, t + 24, d)
         q += 32
     while q + 8 <= end:
-        a = load_wide(F, target + q)
-        source = gathered + first * rows + q
-        at = coefficients + first * stride
-        for _ in range(first, count):
-            a = fma(splat_wide(F[at]), load_wide(F, source), a)
-            source += rows
-            at += stride
-        store(F, target + q, a)
+        accumulate_lanes(splat_wide(0.0), F, target + q, rows, gathered + q, first, count, coefficients, stride)
         q += 8
     if q < end:
-        e = load(F, target + q)
-        source = gathered + first * rows + q
-        at = coefficients + first * stride
-        for _ in range(first, count):
-            e = fma(splat(F[at]), load(F, source), e)
-            source += rows
-            at += stride
-        store(F, target + q, e)
+        accumulate_lanes(splat(0.0), F, target + q, rows, gathered + q, first, count, coefficients, stride)
 
 
 @njit(cache=True, error_model="numpy")
-def accumulate_four(F, target, begin, rows, gathered, first, count, coefficients, stride):
+def accumulate_lanes(like, F, target, rows, gathered, first, count, coefficients, stride):
+    """`accumulate` for as many ``q`` as ``like`` has lanes."""
+    a = load_like(like, F, target)
+    source = gathered + first * rows
+    at = coefficients + first * stride
+    for _ in range(first, count):
+        a = fma(splat_like(like, F[at]), load_like(like, F, source), a)
+        source += rows
+        at += stride
+    store(F, target, a)
+
+
+@njit(cache=True, error_model="numpy")
+def accumulate_four(F, target, begin, end, rows, gathered, first, count, coefficients, stride):
     """`accumulate` for four targets, ``rows`` apart, whose coefficients are neighbours: register tiles of 4 x 16."""
     q = begin
-    while q + 16 <= rows:
+    while q + 16 <= end:
         t0, t1, t2, t3 = target + q, target + rows + q, target + 2 * rows + q, target + 3 * rows + q
         a0, a1, a2, a3 = load_wide(F, t0), load_wide(F, t1), load_wide(F, t2), load_wide(F, t3)
         b0, b1, b2, b3 = load_wide(F, t0 + 8), load_wide(F, t1 + 8), load_wide(F, t2 + 8), load_wide(F, t3 + 8)
@@ -81,38 +80,30 @@ def accumulate_four(F, target, begin, rows, gathered, first, count, coefficients
         store(F, t2 + 8, b2)
         store(F, t3 + 8, b3)
         q += 16
-    if q + 8 <= rows:
-        t0, t1, t2, t3 = target + q, target + rows + q, target + 2 * rows + q, target + 3 * rows + q
-        a0, a1, a2, a3 = load_wide(F, t0), load_wide(F, t1), load_wide(F, t2), load_wide(F, t3)
-        source = gathered + first * rows + q
-        at = coefficients + first * stride
-        for _ in range(first, count):
-            u = load_wide(F, source)
-            a0 = fma(splat_wide(F[at]), u, a0)
-            a1 = fma(splat_wide(F[at + 1]), u, a1)
-            a2 = fma(splat_wide(F[at + 2]), u, a2)
-            a3 = fma(splat_wide(F[at + 3]), u, a3)
-            source += rows
-            at += stride
-        store(F, t0, a0)
-        store(F, t1, a1)
-        store(F, t2, a2)
-        store(F, t3, a3)
+    if q + 8 <= end:
+        accumulate_four_lanes(splat_wide(0.0), F, target + q, rows, gathered + q, first, count, coefficients, stride)
         q += 8
-    if q < rows:
-        t0, t1, t2, t3 = target + q, target + rows + q, target + 2 * rows + q, target + 3 * rows + q
-        e0, e1, e2, e3 = load(F, t0), load(F, t1), load(F, t2), load(F, t3)
-        source = gathered + first * rows + q
-        at = coefficients + first * stride
-        for _ in range(first, count):
-            x = load(F, source)
-            e0 = fma(splat(F[at]), x, e0)
-            e1 = fma(splat(F[at + 1]), x, e1)
-            e2 = fma(splat(F[at + 2]), x, e2)
-            e3 = fma(splat(F[at + 3]), x, e3)
-            source += rows
-            at += stride
-        store(F, t0, e0)
-        store(F, t1, e1)
-        store(F, t2, e2)
-        store(F, t3, e3)
+    if q < end:
+        accumulate_four_lanes(splat(0.0), F, target + q, rows, gathered + q, first, count, coefficients, stride)
+
+
+@njit(cache=True, error_model="numpy")
+def accumulate_four_lanes(like, F, target, rows, gathered, first, count, coefficients, stride):
+    """`accumulate_four` for as many ``q`` as ``like`` has lanes."""
+    t1, t2, t3 = target + rows, target + 2 * rows, target + 3 * rows
+    a0, a1 = load_like(like, F, target), load_like(like, F, t1)
+    a2, a3 = load_like(like, F, t2), load_like(like, F, t3)
+    source = gathered + first * rows
+    at = coefficients + first * stride
+    for _ in range(first, count):
+        u = load_like(like, F, source)
+        a0 = fma(splat_like(like, F[at]), u, a0)
+        a1 = fma(splat_like(like, F[at + 1]), u, a1)
+        a2 = fma(splat_like(like, F[at + 2]), u, a2)
+        a3 = fma(splat_like(like, F[at + 3]), u, a3)
+        source += rows
+        at += stride
+    store(F, target, a0)
+    store(F, t1, a1)
+    store(F, t2, a2)
+    store(F, t3, a3)
