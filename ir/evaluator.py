@@ -15,8 +15,11 @@ from mn_onnx.ir.network import Floats, Integers, KnotTable, Network, Unit
 from mn_onnx.ir.ranges import RangeMaximum
 from mn_onnx.ir.scalar.derivative import derivative
 
-# Values of all variables of one chunk of points; small enough for the caches of a core.
-CHUNK_BYTES = 1 << 20
+CHUNK = 1 << 15
+"""Pre-activations of a level that are evaluated at a time: small enough for the caches of a core."""
+
+FEWEST_POINTS = 64
+"""... but of at least so many points, which a product of matrices needs to be fast."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -152,6 +155,25 @@ def _groups(network: Network, block: LevelBlock, true_functions: bool) -> list[F
     return groups
 
 
+@dataclass(frozen=True, eq=False)
+class _Buffers:
+    """Memory for one chunk of points, used again for the next: fresh pages cost more than what is computed on them.
+
+    ``variables``, ``adjoint`` [n, v]; ``pre_activations``, ``of_t`` [n, u] for each level.
+    """
+
+    variables: Floats
+    adjoint: Floats
+    pre_activations: list[Floats]
+    of_t: list[Floats]
+
+    def rows(self, n: int) -> _Buffers:
+        """Those of the first ``n`` points."""
+        return _Buffers(
+            self.variables[:n], self.adjoint[:n], [t[:n] for t in self.pre_activations], [t[:n] for t in self.of_t]
+        )
+
+
 class Evaluator:
     """A network prepared for evaluation at many points.
 
@@ -162,31 +184,13 @@ class Evaluator:
         self.network = network
         self.levels = [(block, _groups(network, block, true_functions)) for block in level_blocks(network)]
 
-    def chunks(self, points: Floats) -> Iterator[slice]:
-        """Slices of ``points`` that are evaluated at a time, so that memory stays bounded."""
-        size = max(64, CHUNK_BYTES // (8 * max(1, self.network.n_variables)))
-        yield from (slice(start, start + size) for start in range(0, points.shape[0], size))
-
-    def forward(self, points: Floats) -> tuple[Floats, list[Floats]]:
-        """Values of all variables [n, v], and the pre-activations [n, u] of each level."""
-        variables = np.empty((points.shape[0], self.network.n_variables))
-        variables[:, : self.network.input_dim] = points
-        pre_activations = []
-        for block, groups in self.levels:
-            t = variables[:, contiguous(block.columns)] @ block.weights.T + block.bias
-            for group in groups:
-                variables[:, group.outputs] = group.function.values(t[:, group.positions])
-            pre_activations.append(t)
-        return variables, pre_activations
-
     def values(self, points: Floats) -> Floats:
         """``f`` at ``points`` (float64 [n, input_dim]), float64 [n]."""
         points = validated_points(self.network, points)
-        output = self.network.output
         result = np.empty(points.shape[0])
-        for chunk in self.chunks(points):
-            variables, _ = self.forward(points[chunk])
-            result[chunk] = variables[:, contiguous(output.columns)] @ output.weights + output.bias
+        for chunk, buffers in self._chunks_with_buffers(points, with_gradients=False):
+            self._forward(points[chunk], buffers)
+            result[chunk] = self._output(buffers)
         return result
 
     def gradients(self, points: Floats) -> Floats:
@@ -196,19 +200,58 @@ class Evaluator:
     def values_and_gradients(self, points: Floats) -> tuple[Floats, Floats]:
         """`values` and `gradients` at ``points`` (float64 [n, input_dim]) in one pass."""
         points = validated_points(self.network, points)
-        output = self.network.output
         values, gradients = np.empty(points.shape[0]), np.empty_like(points)
-        for chunk in self.chunks(points):
-            variables, pre_activations = self.forward(points[chunk])
-            values[chunk] = variables[:, contiguous(output.columns)] @ output.weights + output.bias
-            gradients[chunk] = self._backward(pre_activations, values[chunk].size)
+        for chunk, buffers in self._chunks_with_buffers(points, with_gradients=True):
+            self._forward(points[chunk], buffers)
+            values[chunk] = self._output(buffers)
+            gradients[chunk] = self._backward(buffers)
         return values, gradients
 
-    def _backward(self, pre_activations: list[Floats], n_points: int) -> Floats:
-        adjoint = np.zeros((n_points, self.network.n_variables))
-        adjoint[:, self.network.output.columns] = self.network.output.weights
-        for (block, groups), t in zip(reversed(self.levels), reversed(pre_activations), strict=True):
-            of_t = np.zeros_like(t)
+    def chunks(self, points: Floats) -> Iterator[slice]:
+        """Slices of ``points`` to evaluate at a time."""
+        size = self._chunk_size(points)
+        yield from (slice(start, start + size) for start in range(0, points.shape[0], size))
+
+    def _chunk_size(self, points: Floats) -> int:
+        widest = max((block.bias.size for block, _ in self.levels), default=1)
+        return min(max(FEWEST_POINTS, CHUNK // widest), max(1, points.shape[0]))
+
+    def _chunks_with_buffers(self, points: Floats, *, with_gradients: bool) -> Iterator[tuple[slice, _Buffers]]:
+        """`chunks`, each with memory for it."""
+        size, n_variables = self._chunk_size(points), self.network.n_variables
+        widths = [block.bias.size for block, _ in self.levels]
+        buffers = _Buffers(
+            np.empty((size, n_variables)),
+            np.empty((size, n_variables if with_gradients else 0)),
+            [np.empty((size, width)) for width in widths],
+            [np.empty((size, width if with_gradients else 0)) for width in widths],
+        )
+        for chunk in self.chunks(points):
+            yield chunk, buffers.rows(min(size, points.shape[0] - chunk.start))
+
+    def _forward(self, points: Floats, buffers: _Buffers) -> None:
+        """Fill in the values of all variables and the pre-activations."""
+        variables = buffers.variables
+        variables[:, : self.network.input_dim] = points
+        for (block, groups), t in zip(self.levels, buffers.pre_activations, strict=True):
+            np.matmul(variables[:, contiguous(block.columns)], block.weights.T, out=t)
+            t += block.bias
+            for group in groups:
+                variables[:, group.outputs] = group.function.values(t[:, group.positions])
+
+    def _output(self, buffers: _Buffers) -> Floats:
+        output = self.network.output
+        result: Floats = buffers.variables[:, contiguous(output.columns)] @ output.weights + output.bias
+        return result
+
+    def _backward(self, buffers: _Buffers) -> Floats:
+        """The gradients with respect to the points, after `_forward`."""
+        adjoint, output = buffers.adjoint, self.network.output
+        adjoint[...] = 0.0
+        adjoint[:, output.columns] = output.weights
+        backward = zip(reversed(self.levels), reversed(buffers.pre_activations), reversed(buffers.of_t), strict=True)
+        for (block, groups), t, of_t in backward:
+            of_t[...] = 0.0
             for group in groups:
                 slopes = group.function.slopes(t[:, group.positions])
                 slopes *= adjoint[:, group.outputs]

@@ -268,6 +268,24 @@ def test_wrong_arity_is_refused() -> None:
         apply("maximum", T)
 
 
+@pytest.mark.parametrize(
+    ("name", "form"),
+    [
+        ("softplus", lambda x: math.log1p(math.exp(-abs(x))) + max(x, 0.0)),
+        ("sigmoid", lambda x: 1.0 / (1.0 + math.exp(-x)) if x >= 0 else math.exp(x) / (1.0 + math.exp(x))),
+    ],
+)
+def test_exponential_functions_of_large_arrays_agree_with_the_library(name: str, form: Callable[[float], float]) -> None:
+    rng = np.random.default_rng(0)
+    t = np.concatenate([rng.normal(size=3000) * scale for scale in (1e-9, 0.1, 1.0, 20.0, 150.0)] + [[0.0, -0.0]])
+    expected = np.array([form(x) for x in t.tolist()])
+    assert (np.abs(evaluate(apply(name, T), t) - expected) / np.spacing(expected)).max() < 5
+    beyond = np.concatenate([np.full(5000, -1e4), [-np.inf, np.inf, np.nan, 1e4, -745.0]])
+    limits = {"softplus": [np.inf, np.nan, 1e4], "sigmoid": [1.0, np.nan, 1.0]}[name]
+    found = evaluate(apply(name, T), beyond)
+    np.testing.assert_allclose(found, [0.0] * 5001 + limits + [0.0], rtol=0, atol=1e-307)
+
+
 @pytest.mark.parametrize(("library", "name"), [(np.sin, "sin"), (np.cos, "cos")])
 def test_waves_of_large_arrays_agree_with_the_library(library: Callable[[np.ndarray], np.ndarray], name: str) -> None:
     rng = np.random.default_rng(0)

@@ -14,17 +14,6 @@ from mn_onnx.ir.network import Floats
 SMALL = 4096
 
 
-def sigmoid(x: Floats) -> Floats:
-    """``1 / (1 + exp(-x))`` with small relative error on both sides."""
-    decay = np.exp(-np.abs(x))
-    return np.where(x >= 0, 1.0, decay) / (1.0 + decay)
-
-
-def softplus(x: Floats) -> Floats:
-    """``log(1 + exp(x))`` without overflow."""
-    return np.maximum(x, 0.0) + np.log1p(np.exp(-np.abs(x)))
-
-
 @functools.cache
 def _compiled() -> ModuleType:
     # Imported here because compiled code is only worth its start-up time for large arrays.
@@ -33,14 +22,28 @@ def _compiled() -> ModuleType:
     return compiled
 
 
+def sigmoid(x: Floats) -> Floats:
+    """``1 / (1 + exp(-x))`` with small relative error on both sides, or an error below 1e-307."""
+    if np.size(x) > SMALL:
+        return _compiled().sigmoid(x)
+    decay = np.exp(-np.abs(x))
+    return np.where(x >= 0, 1.0, decay) / (1.0 + decay)
+
+
+def softplus(x: Floats) -> Floats:
+    """``log(1 + exp(x))`` without overflow, with small relative error or one below 1e-307."""
+    if np.size(x) > SMALL:
+        return _compiled().softplus(x)
+    return np.maximum(x, 0.0) + np.log1p(np.exp(-np.abs(x)))
+
+
 def _wave(x: Floats, quarters: int, library: Callable[[Floats], Floats]) -> Floats:
     values = np.asarray(x, np.float64)
     if values.size <= SMALL:
         return library(values)
     if not max(-values.min(), values.max()) <= _compiled().LARGEST_ARGUMENT:
         return library(values)
-    result: Floats = _compiled().wave(values, quarters)
-    return result
+    return _compiled().wave(values, quarters)
 
 
 def sin(x: Floats) -> Floats:
