@@ -12,7 +12,7 @@ Its keys:
   bound above a twentieth of the box, which says nothing; ``gradient_angle_median``, in degrees: between the gradients
   of the surrogates and of the true network on the faces, ``turned_share``: the part of the area where it exceeds 90, so
   that the topology need not be that of the network; null for exact networks;
-- ``polish``: what moving the vertices onto the true level set did (`mn_onnx.extract.polish.Polish`), and
+- ``polish``: what moving the vertices onto the true level set did (`mn_onnx.extract.smooth.polish.Polish`), and
   ``true_max_abs_f``, ``true_mean_abs_f`` on its faces, before it with ``_before``; null where not asked for. All
   invariants are those of the polished mesh, the values of `Residuals` those of the mesh before;
 - ``output_range``: the certified range of the piecewise-linear f, which is zero on the level set, in the box;

@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mn_onnx.errors import UsageError
-from mn_onnx.extract.face_errors import surface_errors
-from mn_onnx.extract.polish import polish
 from mn_onnx.extract.sampling import sample_surface
+from mn_onnx.extract.smooth.face_errors import surface_errors
+from mn_onnx.extract.smooth.polish import polish
 from mn_onnx.extract.surface import Surface
 from mn_onnx.ir.evaluate import gradient
 from mn_onnx.ir.forecast import Forecast, forecast

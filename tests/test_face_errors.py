@@ -7,7 +7,7 @@ import pytest
 from ir_networks import ELU, RELU, SILU, SINE, dense, softplus
 from smooth_models import HIGH, LOW, extracted
 
-from mn_onnx.extract.face_errors import polygon_errors, surface_errors
+from mn_onnx.extract.smooth.face_errors import polygon_errors, surface_errors
 from mn_onnx.extract.surface import Surface
 from mn_onnx.ir.evaluate import evaluate
 from mn_onnx.ir.expression import Expression

@@ -11,8 +11,8 @@ from small_models import octahedron_model
 from smooth_models import HIGH, LOW, extracted, soft_octahedron_model
 
 from mn_onnx.extract.invariants import check_invariants
-from mn_onnx.extract.polish import FLATNESS, polish
 from mn_onnx.extract.sampling import sample_surface
+from mn_onnx.extract.smooth.polish import FLATNESS, polish
 from mn_onnx.extract.surface import Surface
 from mn_onnx.extraction import extract
 from mn_onnx.ir.evaluate import evaluate, gradient

@@ -9,7 +9,7 @@ import pytest
 from smooth_models import soft_octahedron_model
 
 from mn_onnx.extract.invariants import check_invariants
-from mn_onnx.extract.subdivide import subdivide
+from mn_onnx.extract.smooth.subdivide import subdivide
 from mn_onnx.extract.surface import Surface
 from mn_onnx.extraction import extract
 

@@ -71,7 +71,7 @@ def outward(lower: Floats, upper: Floats) -> Interval:
 
 
 def outward_elementary(lower: Floats, upper: Floats) -> Interval:
-    """Outward by the error of an elementary function, and by a few times the smallest normal number against underflow."""
+    """Outward by the error of an elementary function, and by a few of the smallest normal numbers (underflow)."""
     below = lower - (ELEMENTARY_ULPS * np.spacing(np.abs(lower)) + TINY)
     above = upper + (ELEMENTARY_ULPS * np.spacing(np.abs(upper)) + TINY)
     # The spacing of an infinite number is undefined; such an end stays as it is.

@@ -1,8 +1,8 @@
 """Moves a surface onto the level set of the true network: keeps the topology, turns no face over.
 
-Vertices follow the gradient of the true network (`mn_onnx.extract.projection`). Faces that this turns over are turned
-back by sliding vertices along the level set (`mn_onnx.extract.unfold`), else by going back the way they came. Then
-faces whose middle is too far from the level set, which is curved, are divided (`mn_onnx.extract.subdivide`).
+Vertices follow the gradient of the true network (`projection`). Faces that this turns over are turned back by sliding
+vertices along the level set (`unfold`), else by going back the way they came. Then faces whose middle is too far from
+the level set, which is curved, are divided (`subdivide`).
 
 Where the gradients of the surrogate and of the true network are less than 90 degrees apart throughout, every mixture of
 both has a gradient there, none of its level sets has a critical point, and both surfaces have the same topology
@@ -18,10 +18,10 @@ from numpy.typing import NDArray
 
 from mn_onnx.extract.blocks import resolve_threads
 from mn_onnx.extract.measures import measure_polygons
-from mn_onnx.extract.projection import Projection, TrueField
-from mn_onnx.extract.subdivide import subdivide
+from mn_onnx.extract.smooth.projection import Projection, TrueField
+from mn_onnx.extract.smooth.subdivide import subdivide
+from mn_onnx.extract.smooth.unfold import Neighbours, mean_over_corners, unfold
 from mn_onnx.extract.surface import Surface
-from mn_onnx.extract.unfold import Neighbours, mean_over_corners, unfold
 from mn_onnx.ir.network import Network
 
 Floats = NDArray[np.float64]
