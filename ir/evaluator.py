@@ -214,7 +214,8 @@ class Evaluator:
 
     def _chunk_size(self, points: Floats) -> int:
         widest = max((block.bias.size for block, _ in self.levels), default=1)
-        return min(max(FEWEST_POINTS, CHUNK // widest), max(1, points.shape[0]))
+        size: int = min(max(FEWEST_POINTS, CHUNK // widest), max(1, points.shape[0]))
+        return size
 
     def _chunks_with_buffers(self, points: Floats, *, with_gradients: bool) -> Iterator[tuple[slice, _Buffers]]:
         """`chunks`, each with memory for it."""

@@ -6,7 +6,7 @@ middle of the common edge as one more corner, so that all edges still join two p
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numba
 import numpy as np
@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from mn_onnx.extract.blocks import Indices, index_dtype
 from mn_onnx.extract.edges import half_edge_heads, pair_half_edges
+from mn_onnx.extract.smooth.faces import mean_over_corners
 from mn_onnx.extract.surface import Surface
 
 Floats = NDArray[np.float64]
@@ -120,13 +121,33 @@ def _fill(
     new_offsets[polygon_out] = corner_out
 
 
-def subdivide(surface: Surface, chosen: Integers, free: Booleans, threads: int) -> tuple[Surface, Booleans, Integers]:
+@dataclass(frozen=True, eq=False)
+class Division:
+    """What `subdivide` gives.
+
+    ``order``: int64 [v], vertex ``i`` of ``surface`` was vertex ``order[i]``, or is new from the number of old vertices
+    on. By rising ``i`` for these: ``free``, bool [new, 3], the axes along which they may move; ``carried``, [new, k],
+    the means of what their edges' or polygons' corners carry; ``centre_of``, int64 [new], the polygon that each is the
+    centre of, or -1. ``parents``: int64 [p], the polygons that those of ``surface`` are parts of; ``whole``: bool [p],
+    whether they still have the same corners.
+    """
+
+    surface: Surface
+    order: Integers
+    free: Booleans
+    carried: Floats
+    centre_of: Integers
+    parents: Integers
+    whole: Booleans
+
+
+def subdivide(surface: Surface, chosen: Integers, free: Booleans, carried: Floats, threads: int) -> Division:
     """Divide the polygons ``chosen`` (int64 [n]) of ``surface``; no vertex moves.
 
-    ``free``: bool [v, 3], the axes along which vertices may move. Returns the divided surface, ``free`` of its new
-    vertices by rising number (bool [new, 3]), and ``order``, int64: vertex ``i`` of the divided surface was
-    vertex ``order[i]``, or is new from the number of old vertices on. Attributes and errors are those of the parents.
+    ``free``: bool [v, 3], the axes along which vertices may move. ``carried``: float64 [v, k], what else vertices
+    carry. Attributes and errors of polygons are those of the parents.
     """
+    chosen = np.sort(chosen)
     divided = np.zeros(surface.n_polygons, bool)
     divided[chosen] = True
     halved = np.zeros(surface.n_corners, bool)
@@ -143,12 +164,12 @@ def subdivide(surface: Surface, chosen: Integers, free: Booleans, threads: int) 
     centres = np.full(surface.n_polygons, -1, np.int64)
     centres[divided] = n_old + first_side.size + np.arange(chosen.size)
     tails, ends = surface.corners[first_side], heads[first_side]
-    centre_points = np.add.reduceat(surface.vertices[surface.corners], surface.offsets[:-1], axis=0)[divided]
-    vertices = np.concatenate([
-        surface.vertices,
-        0.5 * (surface.vertices[tails] + surface.vertices[ends]),
-        centre_points / surface.polygon_sizes[divided, None],
-    ])  # fmt: skip
+
+    def of_new_vertices(of_vertices: Floats) -> Floats:
+        at_centres = mean_over_corners(of_vertices, surface.offsets, surface.corners, chosen)
+        return np.concatenate([0.5 * (of_vertices[tails] + of_vertices[ends]), at_centres])
+
+    vertices = np.concatenate([surface.vertices, of_new_vertices(surface.vertices)])
     on_box = surface.box_faces[first_side] >= 0
     free_middles = np.ones((first_side.size, 3), bool)
     free_middles[on_box] = free[tails[on_box]] | free[ends[on_box]]
@@ -174,8 +195,17 @@ def subdivide(surface: Surface, chosen: Integers, free: Booleans, threads: int) 
         errors=surface.errors[parents],
         attributes={name: values[parents] for name, values in surface.attributes.items()},
     )
-    of_new = np.concatenate([free_middles, np.ones((chosen.size, 3), bool)])
-    return result, of_new[order[order >= n_old] - n_old], order
+    new = order[order >= n_old] - n_old
+    whole = ~(np.logical_or.reduceat(halved, surface.offsets[:-1]) | divided)
+    return Division(
+        surface=result,
+        order=order,
+        free=np.concatenate([free_middles, np.ones((chosen.size, 3), bool)])[new],
+        carried=of_new_vertices(carried)[new],
+        centre_of=np.concatenate([np.full(first_side.size, -1), chosen])[new],
+        parents=parents,
+        whole=whole[parents],
+    )
 
 
 def _by_first_corner(corners: Indices, n_vertices: int) -> tuple[Integers, Indices]:

@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 
 from mn_onnx.extract.blocks import Indices
 from mn_onnx.extract.edges import corners_by_vertex, half_edge_heads
-from mn_onnx.extract.measures import measure_polygons
+from mn_onnx.extract.smooth.faces import facing
+from mn_onnx.extract.smooth.projection import Projection
 from mn_onnx.extract.surface import Surface
 
 Floats = NDArray[np.float64]
@@ -24,6 +25,9 @@ Integers = NDArray[np.int64]
 ROUNDS = 24
 ROUNDS_PER_RING = 4
 """So often a patch of some rings of vertices around the faces is tried before it grows by one ring."""
+
+RETREATS = 12
+"""Vertices of faces that stay turned over go half the way back this often, then all the way."""
 
 SWEEPS = 8
 DAMPING = 0.7
@@ -58,15 +62,8 @@ class Neighbours:
         return np.unique(self.corners[_ranges(self.offsets[polygons], self.offsets[polygons + 1])]).astype(np.int64)
 
     def facing(self, polygons: Integers, positions: Floats, gradients: Floats) -> Floats:
-        """The area of each of ``polygons`` times the slope along its normal, [n]: negative where it is turned over.
-
-        ``positions``, ``gradients``: [v, 3], of all vertices; a polygon's gradient is the mean of its corners'.
-        """
-        corners = self.corners[_ranges(self.offsets[polygons], self.offsets[polygons + 1])]
-        sizes = self.offsets[polygons + 1] - self.offsets[polygons]
-        offsets = np.concatenate([np.zeros(1, np.int64), np.cumsum(sizes)])
-        area_vectors = measure_polygons(positions, offsets, corners, 1).area_vectors
-        return np.asarray(np.einsum("ij,ij->i", area_vectors, mean_over_corners(gradients, offsets, corners)))
+        """`facing` of ``polygons``."""
+        return facing(positions, gradients, self.offsets, self.corners, polygons)
 
 
 def _ranges(begins: Integers, ends: Integers) -> Integers:
@@ -74,15 +71,6 @@ def _ranges(begins: Integers, ends: Integers) -> Integers:
     sizes = ends - begins
     shifts = begins - (np.cumsum(sizes) - sizes)
     return np.asarray(np.arange(int(sizes.sum()), dtype=np.int64) + np.repeat(shifts, sizes))
-
-
-def mean_over_corners(of_vertices: Floats, offsets: NDArray[np.int64], corners: Indices) -> Floats:
-    """The mean of ``of_vertices`` [v, 3] over the corners of each polygon, [p, 3]."""
-    if offsets.size == 1:
-        return np.empty((0, 3))
-    totals = np.stack([np.add.reduceat(of_vertices[corners, axis], offsets[:-1]) for axis in range(3)], axis=1)
-    means: Floats = totals / np.diff(offsets)[:, None]
-    return means
 
 
 def unfold(
@@ -130,3 +118,45 @@ def _smooth(neighbours: Neighbours, patch: Integers, positions: Floats, gradient
         moves = means / valences[:, None] - positions[patch]
         moves -= np.einsum("ij,ij->i", moves, normals)[:, None] * normals
         positions[patch] += DAMPING * moves
+
+
+def turn_back(
+    surface: Surface, projection: Projection, upright: NDArray[np.bool_], polygons: Integers, threads: int
+) -> tuple[Integers, Integers]:
+    """Turn back the faces that the projection turned over; returns the vertices that slid, and those held back.
+
+    ``surface``: with the vertices where they were before. ``upright``: bool [p], the polygons that faced along the true
+    gradient then; none of them stays turned over. ``polygons``: those with a vertex that was projected.
+    """
+    nobody = np.zeros(0, np.int64)
+    folded = polygons[
+        facing(projection.positions, projection.gradients, surface.offsets, surface.corners, polygons) < 0
+    ]
+    if not folded.size:
+        return nobody, nobody
+    neighbours = Neighbours.of(surface, threads)
+    movable = np.asarray(projection.free.all(axis=1))
+
+    def project(vertices: Integers) -> None:
+        projection.evaluate(vertices)
+        projection.project(vertices)
+
+    folded, slid = unfold(neighbours, folded, projection.positions, projection.gradients, movable, project)
+    folded = folded[upright[folded]]
+    goals = projection.positions.copy()
+    shares = np.ones(surface.n_vertices)
+    retreats = 0
+    while folded.size:
+        back = neighbours.vertices_of(folded)
+        back = back[shares[back] > 0]
+        if not back.size:
+            break
+        shares[back] *= 0.5 if retreats < RETREATS else 0.0
+        retreats += 1
+        start = surface.vertices[back]
+        projection.positions[back] = start + shares[back, None] * (goals[back] - start)
+        projection.evaluate(back)
+        touched = neighbours.polygons_at(back)
+        touched = touched[upright[touched]]
+        folded = touched[neighbours.facing(touched, projection.positions, projection.gradients) < 0]
+    return slid, np.flatnonzero(shares < 1.0)

@@ -25,7 +25,8 @@ def _compiled() -> ModuleType:
 def sigmoid(x: Floats) -> Floats:
     """``1 / (1 + exp(-x))`` with small relative error on both sides, or an error below 1e-307."""
     if np.size(x) > SMALL:
-        return _compiled().sigmoid(x)
+        large: Floats = _compiled().sigmoid(x)
+        return large
     decay = np.exp(-np.abs(x))
     return np.where(x >= 0, 1.0, decay) / (1.0 + decay)
 
@@ -33,7 +34,8 @@ def sigmoid(x: Floats) -> Floats:
 def softplus(x: Floats) -> Floats:
     """``log(1 + exp(x))`` without overflow, with small relative error or one below 1e-307."""
     if np.size(x) > SMALL:
-        return _compiled().softplus(x)
+        large: Floats = _compiled().softplus(x)
+        return large
     return np.maximum(x, 0.0) + np.log1p(np.exp(-np.abs(x)))
 
 
@@ -43,7 +45,8 @@ def _wave(x: Floats, quarters: int, library: Callable[[Floats], Floats]) -> Floa
         return library(values)
     if not max(-values.min(), values.max()) <= _compiled().LARGEST_ARGUMENT:
         return library(values)
-    return _compiled().wave(values, quarters)
+    result: Floats = _compiled().wave(values, quarters)
+    return result
 
 
 def sin(x: Floats) -> Floats:
