@@ -7,6 +7,7 @@ import pytest
 from ir_networks import ELU, RELU, SILU, SINE, dense, softplus
 from smooth_models import HIGH, LOW, extracted
 
+from mn_onnx.extract.smooth import face_errors
 from mn_onnx.extract.smooth.face_errors import polygon_errors, surface_errors
 from mn_onnx.extract.surface import Surface
 from mn_onnx.ir.evaluate import evaluate
@@ -58,8 +59,43 @@ def test_exact_networks_have_no_error() -> None:
 def test_segments_in_two_dimensions() -> None:
     network = dense([6], SINE, seed=5, dimension=2)
     table = canonicalize(network, lower=LOW[:2], upper=HIGH[:2], knots_per_period=6).network
-    point = np.array([[0.21, -0.4]])
-    error = polygon_errors(table, point, np.array([0, 2]), np.array([0, 0]), LOW[:2], HIGH[:2])
-    seen = np.abs(evaluate(table, point, true_functions=True) - evaluate(table, point))
+    ends = np.array([[0.21, -0.4], [0.23, -0.38]])
+    error = polygon_errors(table, ends, np.array([0, 2]), np.array([0, 1]), LOW[:2], HIGH[:2])
+    along = np.linspace(0.0, 1.0, 101)[:, None]
+    seen = np.abs(evaluate(table, (1 - along) * ends[0] + along * ends[1], true_functions=True)).max()
     assert seen <= error
-    assert error < 2 * seen + 1e-3
+    assert error < 1.01 * seen
+
+
+@pytest.mark.parametrize("sizes", [1, 8, 64])
+def test_bounds_hold_on_patches_of_any_size(sizes: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(face_errors, "SMALLEST_PATCH", sizes)
+    monkeypatch.setattr(face_errors, "LARGEST_PATCH", sizes)
+    monkeypatch.setattr(face_errors, "CHEAP", 1)
+    canonical, surface = extracted(dense([6, 5], SINE, seed=4), knots=4, lower=SMALL_BOX[0], upper=SMALL_BOX[1])
+    assert surface.n_polygons > 64
+    errors = surface_errors(canonical.network, surface, *SMALL_BOX, threads=1)
+    assert (largest_differences(canonical.network, surface) <= errors).all()
+
+
+def test_bounds_do_not_need_polygons_of_the_surrogates() -> None:
+    canonical, _ = extracted(dense([6, 5], softplus(10.0), seed=6), knots=3)
+    rng = np.random.default_rng(1)
+    corners = rng.uniform(-0.7, 0.7, (300, 1, 3)) + rng.uniform(-0.2, 0.2, (300, 3, 3))
+    errors = polygon_errors(
+        canonical.network, corners.reshape(-1, 3), np.arange(0, 901, 3), np.arange(900), LOW, HIGH, threads=1
+    )
+    inside = np.einsum("sk,pkd->psd", rng.dirichlet(np.ones(3), PER_POLYGON), corners)
+    values = evaluate(canonical.network, inside.reshape(-1, 3), true_functions=True).reshape(300, PER_POLYGON)
+    assert (np.abs(values).max(axis=1) <= errors).all()
+
+
+def test_bounds_hardly_depend_on_the_order_of_polygons() -> None:
+    canonical, surface = extracted(dense([5, 5], SILU, seed=7), knots=6)
+    alone = surface_errors(canonical.network, surface, LOW, HIGH, threads=1)
+    shuffled = np.random.default_rng(2).permutation(surface.n_polygons)
+    sizes = surface.polygon_sizes[shuffled]
+    corners = np.concatenate([surface.corners[surface.offsets[k] : surface.offsets[k + 1]] for k in shuffled])
+    offsets = np.concatenate([[0], np.cumsum(sizes)])
+    found = polygon_errors(canonical.network, surface.vertices, offsets, corners, LOW, HIGH, threads=1)
+    assert np.median(found / alone[shuffled]) == pytest.approx(1, rel=0.1)
