@@ -121,15 +121,19 @@ def patch_extents(
 
 
 @numba.njit(cache=True, nogil=True)
-def _search(starts: Floats, low: int, end: int, t: float) -> int:
-    """The interval of ``t`` among ``low`` .. ``end - 1``."""
-    high = end - 1
-    while low < high:
-        middle = (low + high + 1) >> 1
+def find_interval(starts: Floats, first: int, end: int, guess: int, t: float) -> int:
+    """The interval of ``t`` among ``first`` .. ``end - 1``, by steps from ``guess`` that double, then by halves."""
+    low, high, step = guess, guess + 1, 1
+    while high < end and starts[high] <= t:
+        low, high, step = high, min(high + step, end), 2 * step
+    while starts[low] > t:
+        low, high, step = max(low - step, first), low, 2 * step
+    while high - low > 1:
+        middle = (low + high) >> 1
         if starts[middle] <= t:
             low = middle
         else:
-            high = middle - 1
+            high = middle
     return low
 
 
@@ -154,8 +158,8 @@ def relax_level(
     starts, slopes, intercepts, errors = tables.starts, tables.slopes, tables.intercepts, tables.errors
     lines, shifts, misses = result.slope, result.intercept, result.error
     # Patches that follow one another are close to one another.
-    last = tables.first[kind]
-    ends = tables.first[kind + 1]
+    begins, ends = tables.first[kind], tables.first[kind + 1]
+    last = begins.copy()
     low, high = np.empty(forms.shape[2]), np.empty(forms.shape[2])
     for patch in range(forms.shape[0]):
         pre_activation_ranges(forms[patch], sizes[patch], half[patch], lowest, highest, low, high)
@@ -163,7 +167,7 @@ def relax_level(
             a, b, end = low[owner[output]], high[owner[output]], ends[output]
             i = last[output]
             if a < starts[i] or (i + 1 < end and starts[i + 1] <= a):
-                i = _search(starts, tables.first[kind[output]], end, a)
+                i = find_interval(starts, begins[output], end, i, a)
                 last[output] = i
             slope, intercept, error = slopes[i], intercepts[i], errors[i]
             farthest = max(abs(a), abs(b))

@@ -25,7 +25,7 @@ LARGEST_PATCH, SMALLEST_PATCH = 256, 8
 there are no more than `CHEAP` of them.
 """
 
-CHEAP = 1 << 15
+CHEAP = 1 << 13
 
 LOOSER = 1.25
 """How much looser bounds may be in the median than those of polygons on their own, where patches may be smaller."""

@@ -10,7 +10,7 @@ from mn_onnx.ir.scalar import UndefinedFunction
 from mn_onnx.ir.surrogate.fit import fit
 
 FINENESS = 1000.0
-"""How many times smaller the error of the close table is, for about thirty times the knots."""
+"""How many times smaller the error of the close table is, about, for some thirty times the knots."""
 
 
 def close_table(function: ScalarFunction, table: KnotTable, output: int, lower: float, upper: float) -> KnotTable:
@@ -24,7 +24,7 @@ def close_table(function: ScalarFunction, table: KnotTable, output: int, lower: 
     if not isinstance(function, Expression) or error == 0.0 or not upper > lower:
         return itself
     try:
-        closer = fit((function,), lower, upper, (error / FINENESS,))
+        closer = fit((function,), lower, upper, (error / FINENESS,), most_excess=2.0)
     except UndefinedFunction:
         return itself
     return closer if np.isfinite(closer.errors).all() else itself

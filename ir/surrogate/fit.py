@@ -44,9 +44,17 @@ def error_of_knots(profile: BendProfile, knots_per_period: float) -> float:
     return (profile.total / intervals) ** 2 / 16
 
 
-def fit(functions: Sequence[ScalarFunction], lower: float, upper: float, tolerances: Sequence[float]) -> KnotTable:
+def fit(
+    functions: Sequence[ScalarFunction],
+    lower: float,
+    upper: float,
+    tolerances: Sequence[float],
+    *,
+    most_excess: float = 1.0,
+) -> KnotTable:
     """One table for all ``functions`` on ``[lower, upper]``, output ``k`` within ``tolerances[k]`` (positive).
 
+    Errors up to ``most_excess`` times the tolerances will do; the knots are fewer attempts' work then.
     Knots are shared: they follow, at every place, the function that bends most beside its tolerance, and include all
     knots of functions that are tables themselves. Outside the range the outer pieces continue; errors are proved for
     the range. Raises `UndefinedFunction` if a function jumps, is unbounded or undefined on the range, or cannot be
@@ -67,7 +75,7 @@ def fit(functions: Sequence[ScalarFunction], lower: float, upper: float, toleran
         nodes = density.place_nodes(np.concatenate([[lower], corners, [upper]]))
         table = _tabulate(functions, nodes)
         excess = np.array([table.errors[index] / tolerances[index] for index, _ in smooth])
-        if excess.max() <= 1.0:
+        if excess.max() <= most_excess:
             return table
         if not np.isfinite(excess).all() or nodes.size > MOST_KNOTS:
             break
