@@ -7,6 +7,7 @@ The output is bounded by a backward pass over the same chords, as in CROWN (Zhan
 
 from __future__ import annotations
 
+import numpy as np
 from numba import njit
 
 from mn_onnx.extract.kernels.error_symbols import pass_errors_on, track_errors
@@ -192,7 +193,7 @@ def bound_units(F, N, X, J, M, tables, cell, system, floats, scratch, tracked):
     errors, carried = scratch, scratch + rows * stride
     read = carried + cols * stride
     J[LEVEL_OUTPUT * M] = J[LEVEL_SYMBOL * M] = 0
-    first, count, linear, dead = 0, 0, 0, 0
+    first, count, linear, dead = np.int64(0), np.int64(0), 0, 0
     for level in range(levels):
         begin, end = N[level_start + level], N[level_start + level + 1]
         # The outputs that no later row reads are at the front: extents only grow with the level.
@@ -226,7 +227,7 @@ def settle_again(F, N, X, J, M, tables, cell, system):
     rows = N[system + SYS_ROWS]
     row_unit = system + SYS_HEADER + N[system + SYS_LEVELS] + 1
     row_col = row_unit + rows
-    row_extremes(F, N, X, M, cell, 0, rows)
+    row_extremes(F, N, X, M, cell, np.int64(0), rows)
     linear, dead = 0, 0
     for r in range(rows):
         if N[row_unit + r] >= 0 and J[KIND * M + r] == UNSTABLE:

@@ -9,6 +9,7 @@ for deep systems only, and not for every cell.
 
 from __future__ import annotations
 
+import numpy as np
 from numba import njit
 
 from mn_onnx.extract.kernels.lanes import fma, load, magnitude, splat, store, total
@@ -75,7 +76,7 @@ def track_errors(F, X, J, M, weights, begin, end, level, first, count, errors, c
             start, stop = J[LEVEL_SYMBOL * M + earlier], J[LEVEL_SYMBOL * M + earlier + 1]
             if start < stop:
                 since = max(first, J[LEVEL_OUTPUT * M + earlier + 1])
-                accumulate_four(F, target, start, stop, stride, carried, since, count, read, 4)
+                accumulate_four(F, target, start, stop, stride, carried, since, count, read, np.int64(4))
         for k in range(4):
             sum_errors(F, X, M, target + k * stride, r + k, symbols)
 

@@ -8,6 +8,7 @@ of dense matrices, in register tiles.
 
 from __future__ import annotations
 
+import numpy as np
 from numba import njit
 
 from mn_onnx.extract.kernels.lanes import splat, store
@@ -47,7 +48,7 @@ def lay_out_folded(N, J, M, system, folded, least):
     level_start = system + SYS_HEADER
     row_unit = level_start + levels + 1
     row_col = row_unit + rows
-    new_rows, new_cols, new_levels, new_units = 0, 0, 0, 0
+    new_rows, new_cols, new_levels, new_units = np.int64(0), np.int64(0), np.int64(0), 0
     new_level_start = folded + SYS_HEADER
     N[new_level_start] = 0
     for level in range(levels):
@@ -154,7 +155,7 @@ def express_settled_rows(F, N, X, J, M, system, floats, settled, new_cols, folde
     col_row = system + SYS_HEADER + N[system + SYS_LEVELS] + 1 + 2 * rows + 1
     col_begin = col_row + cols
     weights = floats + 4 * rows
-    first = 0
+    zero = first = np.int64(0)
     while first < settled:
         level_end = N[col_begin + J[STABLE_COLS * M + first]]
         last = first
@@ -170,10 +171,10 @@ def express_settled_rows(F, N, X, J, M, system, floats, settled, new_cols, folde
                 F[target + p] = X[SLOPE * M + c] * F[source + N[col_row + c]]
         p = first
         while p + 4 <= last:
-            accumulate_four(F, work + p * stride, 0, stride, stride, work, 0, first, scratch + p - first, width)
+            accumulate_four(F, work + p * stride, zero, stride, stride, work, zero, first, scratch + p - first, width)
             p += 4
         while p < last:
-            accumulate(F, work + p * stride, 0, stride, stride, work, 0, first, scratch + p - first, width)
+            accumulate(F, work + p * stride, zero, stride, stride, work, zero, first, scratch + p - first, width)
             p += 1
         first = last
 
@@ -192,7 +193,7 @@ def multiply_settled(F, N, J, M, folded, weights, gathered, settled, work, strid
     rows, cols = N[folded + SYS_ROWS], N[folded + SYS_COLS]
     new_col_row = folded + SYS_HEADER + N[folded + SYS_LEVELS] + 1 + 2 * rows + 1
     col_begin = new_col_row + cols
-    first, k = 0, 0
+    first, k = np.int64(0), 0
     while k < cols:
         # Settled units of this column's level or before do not read it.
         row = J[KEPT_ROWS * M + N[new_col_row + k]]
@@ -227,7 +228,7 @@ def fold(F, N, X, J, M, system, floats, folded, folded_floats, least):
     gathered = work + settled * stride
     express_settled_rows(F, N, X, J, M, system, floats, settled, new_cols, folded, work, stride, gathered)
     weights = floats + 4 * rows
-    begin = 0
+    zero = begin = np.int64(0)
     for p in range(settled):
         c = J[STABLE_COLS * M + p]
         # Later rows only: a settled column is read by no row of its own level or before.
@@ -238,8 +239,8 @@ def fold(F, N, X, J, M, system, floats, folded, folded_floats, least):
             F[gathered + p * new_rows + q] = 0.0
     for axis in range(4):
         target = folded_floats + axis * new_rows
-        gather_column(F, J, M, floats + axis * rows, 0, new_rows, target)
-    accumulate_four(F, folded_floats, 0, new_rows, new_rows, gathered, 0, settled, work + affine, stride)
+        gather_column(F, J, M, floats + axis * rows, zero, new_rows, target)
+    accumulate_four(F, folded_floats, zero, new_rows, new_rows, gathered, zero, settled, work + affine, stride)
     new_weights = folded_floats + 4 * new_rows
     new_out = new_weights + new_cols * new_rows
     out_weights = weights + cols * rows

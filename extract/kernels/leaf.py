@@ -7,6 +7,7 @@ more than one possible state. Cutting a polygon is several times cheaper than sp
 
 from __future__ import annotations
 
+import numpy as np
 from numba import njit
 
 from mn_onnx.extract.kernels.bound import value_range
@@ -105,7 +106,7 @@ def substitute_output(F, N, X, J, M, system, floats, tables, target):
     out_weights = floats + 4 * rows + cols * rows
     for axis in range(4):
         X[target + axis] = F[out_weights + padded(cols) + axis]
-    substitute(F, N, X, J, M, system, tables, rows, out_weights, 1, target)
+    substitute(F, N, X, J, M, system, tables, rows, out_weights, np.int64(1), target)
 
 
 @njit(cache=True, error_model="numpy")
@@ -189,7 +190,7 @@ def emit_leaf(F, N, X, J, M, output, tables, slot_of_tag, cell, cell_rows, syste
     """
     rows = N[system + SYS_ROWS]
     broken = 0
-    r = 0
+    r = np.int64(0)
     opening = True
     while True:
         if opening:

@@ -24,6 +24,7 @@ trimmed by, two for every depth up to `TRIMMED_DEPTHS`: the surface never reache
 
 from __future__ import annotations
 
+import numpy as np
 from numba import njit
 
 SYS_ROWS, SYS_COLS, SYS_LEVELS, SYS_FLOATS, SYS_INTS, SYS_UNITS, SYS_HASH, SYS_HEADER = 0, 1, 2, 3, 4, 5, 6, 8
@@ -32,15 +33,19 @@ CELL_SYSTEM_F, CELL_SYSTEM_I, CELL_VERTICES, CELL_CAPACITY, CELL_FLOATS = 0, 1, 
 CELL_END_F, CELL_END_I, CELL_DEPTH, CELL_HEADER = 5, 6, 7, 8
 
 # Scratch regions of X. CENTRE takes four (the affine coefficients of every row), POLY_A and POLY_B three, FORMS four.
-(CENTRE, RADIUS, LOW, HIGH, SLOPE, OFFSET, ERROR, OUT_COEF, VALUES, OUT_VALUES) = (0, 4, 5, 6, 7, 8, 9, 10, 11, 12)
-(POLY_A, POLY_B, POLY_VALUES, CUT_X, CUT_Y, CUT_Z, CENTRE_AT, FORMS) = (13, 16, 19, 20, 21, 22, 23, 24)
+(CENTRE, RADIUS, LOW, HIGH, SLOPE, OFFSET, ERROR, OUT_COEF) = (0, 4, 5, 6, 7, 8, 9, 10)
+(POLY_VALUES, CUT_X, CUT_Y, CUT_Z, CENTRE_AT, FORMS) = (19, 20, 21, 22, 23, 24)
 OUTPUTS = 28  # eight
 CUT_SHARE, GROWTH, SYMBOL_ERROR = 36, 37, 38
 X_REGIONS = 39
+# Kernels are called with these. numba compiles a kernel once more for every constant among its arguments, except for
+# numpy's: so their numbers are numpy's, as are the constants in the kernels' calls of each other.
+VALUES, OUT_VALUES, POLY_A, POLY_B = np.int64(11), np.int64(12), np.int64(13), np.int64(16)
 
 # Scratch regions of J.
 (STATE_LOW, STATE_HIGH, NEW_INDEX, CUT_OUT, CUT_IN, CUT_NEXT, CUT_PREVIOUS, CUT_FROM) = (0, 1, 2, 3, 4, 5, 6, 7)
-(TAGS_A, TAGS_B, CUT_TO, KEPT_ROWS, STABLE_COLS, CHOICE, CHOICE_FIRST, CHOICE_LAST) = (8, 9, 10, 11, 12, 13, 14, 15)
+TAGS_A, TAGS_B = np.int64(8), np.int64(9)  # kernels are called with them
+(CUT_TO, KEPT_ROWS, STABLE_COLS, CHOICE, CHOICE_FIRST, CHOICE_LAST) = (10, 11, 12, 13, 14, 15)
 (READ_COLS, READ_AT, KIND, BELOW, ABOVE, SIDE_COUNTS) = (16, 17, 18, 19, 20, 21)
 (SYMBOL_AT, LEVEL_OUTPUT, LEVEL_SYMBOL, READ_ROW) = (22, 23, 24, 25)
 J_REGIONS = 26

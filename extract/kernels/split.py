@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numpy as np
 from numba import njit
 
 from mn_onnx.extract.kernels.control import BROKEN_CUTS, STACK_TOP, TOP_F, TOP_I
@@ -126,7 +127,7 @@ def cut_away(F, N, X, J, M, control, slot_of_tag, cell, rows, sign, reach, tag):
     if count == 0 or not link_cut_edges(J, M, slot_of_tag, count):
         return cell
     part = control[TOP_I]
-    vertices = write_half(F, N, X, J, M, cell, rows, rows, count, 1, tag, part, control[TOP_F])
+    vertices = write_half(F, N, X, J, M, cell, rows, rows, count, np.int64(1), tag, part, control[TOP_F])
     N[part + CELL_DEPTH] = N[cell + CELL_DEPTH]
     control[TOP_F] += 3 * N[part + CELL_CAPACITY]
     control[TOP_I] += cell_ints(rows, vertices)
@@ -162,4 +163,4 @@ def push_trimmed(F, N, J, M, control, stack, cell, cell_rows, system, floats):
     vertices = copy_polytope(F, N, cell, cell_rows, N[system + SYS_ROWS], part, at)
     depth = N[cell + CELL_DEPTH] + 1
     low, high = J[STATE_LOW * M], J[STATE_HIGH * M]
-    push_cell(N, J, M, control, stack, part, vertices, depth, system, floats, 0, low, high)
+    push_cell(N, J, M, control, stack, part, vertices, depth, system, floats, np.int64(0), low, high)
