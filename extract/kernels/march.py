@@ -190,7 +190,8 @@ def is_leaf(N, J, M, control, system):
     return count_choices(N, J, M, system, control[LEAF_CHOICES]) <= control[LEAF_CHOICES]
 
 
-@njit(cache=True, error_model="numpy")
+# Inlined before LLVM sees it: as a function of its own, all that it calls would be optimised once more.
+@njit(cache=True, error_model="numpy", inline="always")
 def visit(F, N, X, J, M, control, stack, output, tables, slot_of_tag, cell):
     """Process one cell that has been taken off the stack."""
     floats, system = N[cell + CELL_SYSTEM_F], N[cell + CELL_SYSTEM_I]
