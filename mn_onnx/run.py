@@ -79,5 +79,5 @@ def prepare(model: Model, phases: Phases, *, threads: int | None, check: bool, m
             if parity.problems():
                 raise CheckFailed(parity.problems())
     with phases.phase("compile"):
-        warm_up()
+        warm_up(threads)
     return Run(phases, threads, limit, runtime, parity)

@@ -2,32 +2,80 @@
 
 from __future__ import annotations
 
-import numpy as np
+from contextlib import nullcontext
 
+import numpy as np
+from numba import types
+
+from mn_onnx.extract.blocks import resolve_threads
 from mn_onnx.extract.invariants import check_invariants
+from mn_onnx.extract.kernels.fold import fold
 from mn_onnx.extract.sampling import sample_surface
 from mn_onnx.extract.schedule import traverse
+from mn_onnx.extract.soup import PolygonSoup
 from mn_onnx.extract.surface import Surface
 from mn_onnx.extract.weld import weld
 from mn_onnx.ir.network import AffineRow, KnotTable, Network, Unit
+from mn_onnx.second_compiler import compiling_beside
 
 DIMENSION = 3
 
 
-def warm_up() -> Surface:
+def warm_up(threads: int | None = None) -> Surface:
     """The octahedron |x| + |y| + |z| = 1 / 2; making it goes once through every kernel that extraction and checks need.
 
-    Curves and roots need the same ones, as they are extracted in three dimensions.
+    Curves and roots need the same ones, as they are extracted in three dimensions. With two of ``threads`` (None: all
+    cores) or more, a second process compiles some of the kernels, if need be, while this one compiles the others.
     """
+    with compiling_beside(__name__) if resolve_threads(threads) > 1 else nullcontext():
+        soup, _ = traverse(_octahedral_network(), -np.ones(DIMENSION), np.ones(DIMENSION), threads=1)
+    return _meshed(soup)
+
+
+def _octahedral_network() -> Network:
     one = np.ones(1)
     table = KnotTable.exact([0.0], [[-1.0, 1.0]], [[0.0, 0.0]])
     units = tuple(
         Unit(AffineRow(np.array([axis]), one, 0.0), (table,), f"|x_{axis}|", table) for axis in range(DIMENSION)
     )
     total = AffineRow(np.arange(DIMENSION, 2 * DIMENSION), np.ones(DIMENSION), -0.5)
-    network = Network(DIMENSION, units, total)
-    soup, _ = traverse(network, -np.ones(DIMENSION), np.ones(DIMENSION), threads=1)
+    return Network(DIMENSION, units, total)
+
+
+def _octahedral_soup() -> PolygonSoup:
+    """What the traversal of the octahedron's network gives, but for order and keys."""
+    signs = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
+    # Counter-clockwise seen from outside in the octant where all are positive; every negative sign turns that over.
+    axes = np.array([(0, 1, 2) if octant.prod() > 0 else (0, 2, 1) for octant in signs])
+    ends = np.take_along_axis(signs, axes, 1).reshape(-1)
+    axes = axes.reshape(-1)
+    positions = np.zeros((axes.size, DIMENSION))
+    positions[np.arange(axes.size), axes] = 0.5 * ends
+    keys = np.stack([axes, ends > 0], 1).astype(np.uint64)
+    offsets = np.arange(0, axes.size + 1, DIMENSION)
+    return PolygonSoup(
+        offsets.astype(np.int64),
+        positions,
+        keys,
+        np.full(axes.size, -1, np.int8),
+        signs.astype(np.float64),
+        np.zeros(len(signs)),
+    )
+
+
+def _compile_second_half() -> None:
+    """Folding, which the traversal comes to when about half of it is compiled, and what makes meshes."""
+    floats, integers = types.CPointer(types.float64), types.CPointer(types.int64)
+    fold.compile((floats, integers, floats, integers, *[types.int64] * 6))
+    _meshed(_octahedral_soup())
+
+
+def _meshed(soup: PolygonSoup) -> Surface:
     surface = weld(soup, threads=1)
     check_invariants(surface)
     sample_surface(surface, 1)
     return surface
+
+
+if __name__ == "__main__":  # the second process
+    _compile_second_half()
