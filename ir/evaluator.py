@@ -15,8 +15,8 @@ from mn_onnx.ir.network import Floats, Integers, KnotTable, Network, Unit
 from mn_onnx.ir.ranges import RangeMaximum
 from mn_onnx.ir.scalar.derivative import derivative
 
-CHUNK = 1 << 15
-"""Pre-activations of a level that are evaluated at a time: small enough for the caches of a core."""
+CHUNK = 1 << 17
+"""Pre-activations of a level that are evaluated at a time: what a core's caches hold; with less, threads wait."""
 
 FEWEST_POINTS = 64
 """... but of at least so many points, which a product of matrices needs to be fast."""

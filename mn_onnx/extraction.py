@@ -10,12 +10,13 @@ from mn_onnx.errors import CheckFailed, UsageError
 from mn_onnx.extract.invariants import check_invariants
 from mn_onnx.extract.pipeline import extract_surface
 from mn_onnx.extract.surface import Surface
+from mn_onnx.memory import POLISHING_BYTES
 from mn_onnx.model import LoadOptions, Model
 from mn_onnx.progress import ProgressCallback
 from mn_onnx.reader import ModelSource
 from mn_onnx.report import build_report
 from mn_onnx.run import Phases, loaded, prepare
-from mn_onnx.surrogates import NOT_CERTIFIED, certified, polished, topology_notes
+from mn_onnx.surrogates import NOT_CERTIFIED, certified, polish_notes, polished, topology_notes
 
 DIMENSION = 3
 """Coordinates of a point on a mesh."""
@@ -61,21 +62,23 @@ def extract(
         invariants = check_invariants(surface, bounds=model.bounds)
         if check and surface.n_polygons and invariants.area > 0:
             residuals = measure_residuals(model, surface, run.runtime)
-    certificate, polish_entries, topology = dict[str, Any](NOT_CERTIFIED), None, list[str]()
+    certificate, polish_entries, smooth_notes = dict[str, Any](NOT_CERTIFIED), None, list[str]()
     if not model.exact and surface.n_polygons:
         with phases.phase("certify"):
             surface, certificate = certified(surface, model.canonical, threads=threads)
-            topology = topology_notes(certificate)
+            smooth_notes = topology_notes(certificate)
     if polish and not model.exact and surface.n_polygons:
         with phases.phase("polish"):
             before = true_residuals(model, surface)
-            surface, polish_entries = polished(surface, model.canonical, threads=threads)
+            room = run.limit.room(POLISHING_BYTES)
+            surface, polish_entries = polished(surface, model.canonical, threads=threads, more_polygons=room)
             polish_entries |= {f"{name}_before": value for name, value in before.items()}
             polish_entries |= true_residuals(model, surface)
+            smooth_notes += polish_notes(polish_entries)
         with phases.phase("check"):
             invariants = check_invariants(surface, bounds=model.bounds)
     problems, notes = findings(model, found, invariants, run.parity, residuals)
-    notes += topology
+    notes += smooth_notes
     report = build_report(
         model,
         found,

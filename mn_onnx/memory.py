@@ -16,6 +16,9 @@ SAFE_SHARE = 0.8
 WELDING_BYTES = 80
 """Bytes per polygon corner that a process grows by after the traversal: measured, 49 to weld and up to 75 to check."""
 
+POLISHING_BYTES = 700
+"""Bytes per polygon that a process grows by while faces are divided: measured, 600."""
+
 _UNITS = {"": 1, "K": 1000, "M": 1000**2, "G": 1000**3, "T": 1000**4}
 _UNITS |= {f"{letter}i": 1024**power for power, letter in enumerate("KMGT", start=1)}
 _CGROUP = Path("/sys/fs/cgroup")
@@ -90,6 +93,10 @@ class MemoryLimit:
         if size is not None and size <= 0:
             raise UsageError(f"max_memory must be a positive number of bytes, not {size}")
         return cls(size if size is not None else resident_memory() + int(SAFE_SHARE * available_memory()))
+
+    def room(self, bytes_each: int) -> int:
+        """How many things of ``bytes_each`` still fit."""
+        return max(0, self.size - resident_memory()) // bytes_each
 
     def check(self, polygons: int, corners: int) -> None:
         """Raise `MemoryLimitReached` if the process, or the welding of what is found, needs more than is allowed."""

@@ -62,6 +62,9 @@ VAGUE = 0.05
 
 ANGLE_SAMPLES = 1 << 14
 
+CLOSE_ENOUGH = 1.2
+"""Of the mean |f| that polishing is to reach on faces: what a sample may say by chance."""
+
 NOT_CERTIFIED: Mapping[str, None] = dict.fromkeys(
     (
         "surface_eps",
@@ -257,7 +260,30 @@ def topology_notes(certificate: Mapping[str, Any]) -> list[str]:
     ]
 
 
-def polished(surface: Surface, canonical: Canonical, *, threads: int | None = None) -> tuple[Surface, dict[str, Any]]:
-    """The surface, one of `certified`, moved onto the level set of the true network, and what that did."""
-    moved, result = polish(surface, canonical.network, canonical.lower, canonical.upper, threads=threads)
+def polished(
+    surface: Surface, canonical: Canonical, *, threads: int | None = None, more_polygons: float = math.inf
+) -> tuple[Surface, dict[str, Any]]:
+    """The surface, one of `certified`, moved onto the level set of the true network, and what that did.
+
+    Faces are divided for it; they do not become more than ``more_polygons`` more.
+    """
+    moved, result = polish(
+        surface,
+        canonical.network,
+        canonical.lower,
+        canonical.upper,
+        threads=threads,
+        most_polygons=surface.n_polygons + more_polygons,
+    )
     return moved, asdict(result)
+
+
+def polish_notes(polish: Mapping[str, Any]) -> list[str]:
+    """What is to be said of a polished mesh, a sentence or none; ``polish`` as in the report."""
+    found, wanted = polish["true_mean_abs_f"], polish["wanted_mean_abs_f"]
+    if found <= CLOSE_ENOUGH * wanted:
+        return []
+    return [
+        f"the mean |f_true| on the faces is {found:.2g}, not {wanted:.2g} as it was to be: closer faces would take too "
+        "many polygons or too much memory (--max-memory), or vertices did not reach the level set"
+    ]

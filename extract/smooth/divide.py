@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from mn_onnx.extract.sampling import sample_surface
 from mn_onnx.extract.smooth.faces import facing, mean_over_corners
 from mn_onnx.extract.smooth.projection import Projection
 from mn_onnx.extract.smooth.subdivide import Division, subdivide
@@ -20,12 +21,13 @@ Integers = NDArray[np.int64]
 DIVISIONS = 8
 """Rounds of dividing faces; each makes |f| on them about four times smaller."""
 
-MOST_GROWTH = 4.0
+MOST_GROWTH = 6.0
 SMALL = 1 << 16
 """Dividing faces makes at most this many times as many polygons, or this many in all for a small mesh."""
 
-MEAN_BY_MIDDLE = 0.75
-"""The mean over a triangle by the value at its middle, of a quadratic that is zero at its corners."""
+SAMPLES = 1 << 15
+"""Random points by which the mean over faces is compared with that of their middles: 3/4 where faces are triangles and
+|f| quadratic (exactly), more where the network has creases."""
 
 PART = 0.25
 """|f| in the middle of a part of a face by that of the face."""
@@ -39,31 +41,37 @@ WORTH = 0.25
 """|f| is evaluated on faces whose foretold moment is at least this part of those that were divided."""
 
 
-def divide(surface: Surface, projection: Projection, wanted: float, threads: int) -> tuple[Surface, int, int]:
-    """Divide faces until the mean |f| over them is ``wanted``.
+def divide(
+    surface: Surface, projection: Projection, wanted: float, most_polygons: float, threads: int
+) -> tuple[Surface, int, int]:
+    """Divide faces until the mean |f| over them is ``wanted``, or they are about ``most_polygons``.
 
     ``surface``, with vertices as in ``projection``, which are brought up to date. Faces with a vertex that is not on
     the level set are left alone: dividing them brings them no closer. Returns the surface, how many faces were divided,
     and how many new vertices were held back so that no face turns over.
     """
-    most = max(MOST_GROWTH * surface.n_polygons, SMALL)
+    most = min(max(MOST_GROWTH * surface.n_polygons, SMALL), most_polygons)
     n_divided = n_held = 0
-    # f in the middle of each face, NaN where it is not evaluated, and its foretold size.
-    middle, foretold = np.full(surface.n_polygons, np.nan), np.full(surface.n_polygons, np.inf)
+    # f in the middle of each face, NaN where it is not evaluated, and its foretold size, NaN where it must be.
+    middle, foretold = np.full(surface.n_polygons, np.nan), np.full(surface.n_polygons, np.nan)
     limit = 0.0
     for _ in range(DIVISIONS):
         areas = surface.measures.areas
-        unknown = np.flatnonzero(np.isnan(middle) & ((foretold == np.inf) | (foretold * areas > WORTH * limit)))
+        unknown = np.flatnonzero(np.isnan(middle) & ~(foretold * areas <= WORTH * limit))
         middle[unknown] = projection.field.values(
             mean_over_corners(surface.vertices, surface.offsets, surface.corners, unknown)
         )
         heights = np.where(np.isnan(middle), foretold, np.abs(middle))
         settled = np.logical_and.reduceat(projection.settled()[surface.corners], surface.offsets[:-1])
         moments = np.where(settled, heights, 0.0) * areas
-        chosen, limit = _to_divide(moments, wanted / MEAN_BY_MIDDLE * float(areas.sum()))
+        of_middles = float(moments.sum()) / max(float(areas.sum()), np.finfo(np.float64).tiny)
+        points, polygons = sample_surface(surface, SAMPLES)
+        of_faces = float((np.abs(projection.field.values(points)) * settled[polygons]).mean())
+        goal = wanted * of_middles / max(of_faces, np.finfo(np.float64).tiny)
+        chosen, limit = _to_divide(moments, goal * float(areas.sum()))
         # A polygon of n corners becomes at most n.
         room = np.searchsorted(np.cumsum(surface.polygon_sizes[chosen]), most - surface.n_polygons, side="right")
-        chosen = chosen[:room]
+        full, chosen = room < chosen.size, chosen[:room]
         if not chosen.size:
             break
         division = subdivide(surface, chosen, projection.free, projection.gradients, threads)
@@ -72,9 +80,11 @@ def divide(surface: Surface, projection: Projection, wanted: float, threads: int
         foretold, middle = heights[division.parents], middle[division.parents]
         middle[~division.whole] = np.nan
         touched = np.logical_or.reduceat(moved[surface.corners], surface.offsets[:-1])
-        middle[touched], foretold[touched] = np.nan, np.inf
+        middle[touched] = foretold[touched] = np.nan
         n_divided += int(chosen.size)
         n_held += held
+        if full:
+            break
     return surface, n_divided, n_held
 
 

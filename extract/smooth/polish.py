@@ -41,7 +41,8 @@ class Polish:
     ``stray_vertices``: others that found no root within their reach. ``turned_polygons``, ``turned_area_share``: before
     it, the polygons whose gradient is more than 90 degrees from the true one; near these the topology need not be that
     of the true level set. ``reversed_polygons``: those among them that face against the true gradient afterwards.
-    ``divided_polygons``: how many were divided to come closer to the curved level set.
+    ``divided_polygons``: how many were divided to come closer to the curved level set; ``wanted_mean_abs_f``: the mean
+    |f| over the faces that this was to reach.
     """
 
     max_abs_f_before: float
@@ -58,6 +59,7 @@ class Polish:
     turned_area_share: float
     reversed_polygons: int
     divided_polygons: int
+    wanted_mean_abs_f: float
 
 
 def polish(
@@ -68,13 +70,15 @@ def polish(
     *,
     threads: int | None = None,
     flatness: float = FLATNESS,
+    most_polygons: float = np.inf,
 ) -> tuple[Surface, Polish]:
     """The surface with its vertices on the level set of the true functions of ``network``, and what was done.
 
     ``surface``: the level set of canonical ``network`` in the box ``lower``..``upper`` (float64 [3]). ``flatness``:
     faces are divided until their mean |f| is this part of the typical slope times half of the box (infinite: none
-    is). The polygons of the result need not be flat; their gradients are those of the true network, interpolated
-    where faces were divided; ``errors`` and attributes are those of the polygons they come from.
+    is) or there are about ``most_polygons``. The polygons of the result need not be flat; their gradients are those of
+    the true network, interpolated where faces were divided; ``errors`` and attributes are those of the polygons they
+    come from.
     """
     threads = resolve_threads(threads)
     lower, upper = np.asarray(lower, np.float64), np.asarray(upper, np.float64)
@@ -91,7 +95,7 @@ def polish(
     del moves
     moved = replace(surface, vertices=projection.positions.copy())
     wanted = flatness * projection.slope * 0.5 * float((upper - lower).max())
-    result, divided, held_new = divide(moved, projection, wanted, threads)
+    result, divided, held_new = divide(moved, projection, wanted, most_polygons, threads)
     result, reversed_polygons = _with_gradients(result, projection)
     after = np.abs(projection.values)
     areas = surface.measures.areas
@@ -110,6 +114,7 @@ def polish(
         turned_area_share=float(areas[~upright].sum() / max(areas.sum(), np.finfo(np.float64).tiny)),
         reversed_polygons=reversed_polygons,
         divided_polygons=divided,
+        wanted_mean_abs_f=wanted,
     )
 
 

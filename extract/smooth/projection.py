@@ -189,7 +189,7 @@ class Projection:
         return positions, *self.field.values_and_gradients(positions)
 
     def _settle(self, route: _Route) -> None:
-        """Newton's method, on the gradient of an earlier step where that does."""
+        """Newton's method, on the gradient of an earlier step and the secant along it where that does."""
         share = np.ones(route.vertices.size)
         stale = np.ones(route.vertices.size, bool)
         least = CONVERGED * self.scale
@@ -203,7 +203,11 @@ class Projection:
             positions = self._within(route, at, self.positions[vertices] - (share[at] * before)[:, None] * speed)
             values = self.field.values(positions)
             better = np.abs(values) < np.abs(before)
-            self.positions[vertices[better]], self.values[vertices[better]] = positions[better], values[better]
+            moved = vertices[better]
+            self.positions[moved], self.values[moved] = positions[better], values[better]
+            # The secant: along the gradient, its length is what f has really changed by.
+            ratio = (before - values)[better] / (share[at] * before)[better]
+            self.gradients[moved] *= np.where(np.abs(ratio - 1.0) <= AGREEMENT, ratio, 1.0)[:, None]
             # A step along an old gradient that failed is taken again along the new one before it is shortened.
             share[at] = np.where(better, 1.0, np.where(stale[at], share[at], SHORTENING * share[at]))
             slow = np.abs(values) > FAST * np.abs(before)
