@@ -35,7 +35,7 @@ class Surface:
     polygon, the edge from corner ``twins[c]``. -1 where there is no neighbour.
     ``box_faces``: int8 [c], the box face (2 * axis + side) on which this edge lies, -1 for an edge inside the box.
     ``gradients``: float64 [p, 3], the gradient of ``f`` on the polygon.
-    ``errors``: float64 [p], a proved bound on ``|f_true - f|`` on the polygon; zero for exact networks.
+    ``errors``: float64 [p], a proved bound on ``|f_true|`` on the polygon; zero for exact networks.
     ``attributes``: further values per polygon, each [p] or [p, k], by name.
     ``report``: what the steps that made the surface have to tell, ready for JSON.
     """

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any, Unpack
 
+from mn_onnx.certificate import NOT_CERTIFIED, certified, polish_notes, polished, topology_notes
 from mn_onnx.checks.findings import findings
 from mn_onnx.checks.residual import measure_residuals, true_residuals
 from mn_onnx.errors import CheckFailed, UsageError
@@ -16,7 +17,6 @@ from mn_onnx.progress import ProgressCallback
 from mn_onnx.reader import ModelSource
 from mn_onnx.report import build_report
 from mn_onnx.run import Phases, loaded, prepare
-from mn_onnx.surrogates import NOT_CERTIFIED, certified, polish_notes, polished, topology_notes
 
 DIMENSION = 3
 """Coordinates of a point on a mesh."""
@@ -41,8 +41,8 @@ def extract(
     set of the true network; the topology stays. ``progress``: called with a `ProgressEvent` a few times a second.
 
     Returns a `Surface`: ``vertices`` float64 [v, 3], polygons oriented towards growing f, and ``report``, whose keys
-    `mn_onnx.report` lists. ``errors`` are proved bounds on |f_true - f| on each polygon (before polishing), zero for
-    exact networks. An empty level set is a surface without polygons.
+    `mn_onnx.report` lists. ``errors`` are proved bounds on |f_true - level| on each polygon, zero for exact networks.
+    An empty level set is a surface without polygons.
 
     Raises `UsageError` and `ModelRefused` as `load`; `CheckFailed` with every failed check (``error.surface`` is the
     mesh, if there is one already); `MemoryLimitReached` if the mesh would not fit in ``max_memory``.

@@ -6,15 +6,16 @@ Its keys:
 - ``sign``: positive-outside or positive-inside; ``bounds_from``: option, metadata or default;
 - ``exact``, and ``surrogate_eps``: a proved bound on |f_true - f| in the box, zero for exact networks;
 - ``knots_per_period`` and ``forecast_polygons`` of the surrogates, null for exact networks;
-- ``surface_eps``, ``surface_eps_median``: the proved bound on the polygons of the mesh; ``displacement``,
+- ``surface_eps``, ``surface_eps_median``: proved bounds of |f_true - f| on the polygons of the mesh; ``displacement``,
   ``displacement_median``: that over the slope, how far the true level set may be to first order, where the slope is at
   least a tenth of the median one (``shallow_polygons`` are the others); ``vague_polygons``: those with a displacement
   bound above a twentieth of the box, which says nothing; ``gradient_angle_median``, in degrees: between the gradients
   of the surrogates and of the true network on the faces, ``turned_share``: the part of the area where it exceeds 90, so
   that the topology need not be that of the network; null for exact networks;
 - ``polish``: what moving the vertices onto the true level set did (`mn_onnx.extract.smooth.polish.Polish`), and
-  ``true_max_abs_f``, ``true_mean_abs_f`` on its faces, before it with ``_before``; null where not asked for. All
-  invariants are those of the polished mesh, the values of `Residuals` those of the mesh before;
+  ``true_max_abs_f``, ``true_mean_abs_f`` on its faces, before it with ``_before``, and ``surface_eps`` to
+  ``vague_polygons`` as above, of the polished mesh; null where not asked for. All invariants are those of the polished
+  mesh, the values of `Residuals` those of the mesh before;
 - ``output_range``: the certified range of the piecewise-linear f, which is zero on the level set, in the box;
 - ``polygons``, ``vertices``, ``edges``, ``euler``, ``components``, ``closed`` (every edge inside the box joins two
   polygons), ``boundary_edges`` (on the box), ``unmatched_edges``, and the other values of `Invariants`;

@@ -10,6 +10,8 @@ from ir_networks import SINE, dense
 from small_models import octahedron_model
 from smooth_models import HIGH, LOW, extracted, soft_octahedron_model
 
+from mn_onnx.certificate import certified, polish_notes, polished, topology_notes
+from mn_onnx.checks.residual import true_residuals
 from mn_onnx.extract.invariants import check_invariants
 from mn_onnx.extract.sampling import sample_surface
 from mn_onnx.extract.smooth.polish import FLATNESS, polish
@@ -18,7 +20,6 @@ from mn_onnx.extraction import extract
 from mn_onnx.ir.evaluate import evaluate, gradient
 from mn_onnx.ir.network import AffineRow, Network
 from mn_onnx.model import Model, load
-from mn_onnx.surrogates import certified, topology_notes
 
 ONLY_VERTICES = np.inf
 
@@ -83,11 +84,31 @@ def test_the_report_tells_of_the_polished_mesh(model: Model) -> None:
     report = extract(model, threads=1, polish=True).report
     entries = report["polish"]
     assert entries["true_mean_abs_f_before"] > 1e-4
+    assert entries["surface_eps_median"] < 0.1 * report["surface_eps_median"]
     assert entries["true_mean_abs_f"] < 0.01 * entries["true_mean_abs_f_before"]
     assert report["polygons"] > 100 * report["forecast_polygons"]
     assert (report["closed"], report["euler"], report["problems"]) == (True, 2, [])
     assert report["turned_share"] == 0
     assert 0 < report["gradient_angle_median"] < 45
+
+
+def test_errors_are_proved_of_the_polished_mesh(model: Model) -> None:
+    surface = extract(model, threads=1, polish=True)
+    points, polygons = sample_surface(surface, 1 << 14)
+    true = np.abs(evaluate(model.network, points, true_functions=True))
+    assert (true <= surface.errors[polygons]).all()
+    np.testing.assert_array_equal(surface.errors, surface.attributes["eps"])
+    assert surface.errors.max() == surface.report["polish"]["surface_eps"]
+
+
+def test_a_goal_out_of_reach_is_told(model: Model) -> None:
+    before = extract(model, threads=1)
+    coarse, entries = polished(before, model.canonical, threads=1, more_polygons=1000)
+    assert before.n_polygons < coarse.n_polygons <= before.n_polygons + 1000
+    entries |= true_residuals(model, coarse)
+    (note,) = polish_notes(entries)
+    assert f"{entries['true_mean_abs_f']:.2g}, not {entries['wanted_mean_abs_f']:.2g}" in note
+    assert polish_notes(entries | {"wanted_mean_abs_f": entries["true_mean_abs_f"]}) == []
 
 
 def test_vertices_on_the_box_stay_on_its_faces() -> None:

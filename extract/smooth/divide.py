@@ -22,7 +22,7 @@ DIVISIONS = 8
 """Rounds of dividing faces; each makes |f| on them about four times smaller."""
 
 MOST_GROWTH = 6.0
-SMALL = 1 << 16
+SMALL = 1 << 18
 """Dividing faces makes at most this many times as many polygons, or this many in all for a small mesh."""
 
 SAMPLES = 1 << 15
