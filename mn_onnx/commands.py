@@ -47,7 +47,8 @@ def _extract_one(options: argparse.Namespace, load_model: Callable[[], Model]) -
         if model.dimension < 3:
             return _extract_planar(options, model, progress)
         if model.fineness is not None and not options.quiet:
-            print(f"mn-onnx: {model.fineness.cost(resolve_threads(options.threads))}", file=sys.stderr)
+            cost = model.fineness.cost(resolve_threads(options.threads), polish=options.polish)
+            print(f"mn-onnx: {cost}", file=sys.stderr)
         with _writing(options.mesh):
             check_mesh_options(options.mesh, float64=options.float64, attributes=options.attributes)
         _check_attributes(options.attributes, model)

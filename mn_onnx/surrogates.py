@@ -17,10 +17,10 @@ from mn_onnx.ir.passes import Canonical, canonicalize
 Floats = NDArray[np.float64]
 
 DEFAULT_BUDGET = 2_500_000
-"""Polygons (segments in two dimensions): about a minute on two cores."""
+"""Polygons (segments in two dimensions): about half a minute on two cores."""
 
 TOPOLOGY_BUDGET = 12_000_000
-"""Polygons at most, where fewer would not have the network's topology: some minutes on two cores."""
+"""Polygons at most, where fewer would not have the network's topology: two minutes on two cores."""
 
 TRUSTED_ANGLE = 14.0
 """Degrees that the gradients of the surrogates may be off in the median for the mesh to have the right topology. That
@@ -41,11 +41,11 @@ AIM, ENOUGH = 0.95, 0.85
 CLOSE = 1.05
 """Numbers of knots within this factor are not worth another attempt."""
 
-THREAD_SECONDS = 5e-5
-"""Of traversal, bounds and checks for one polygon; measured on a server of two cores."""
+THREAD_SECONDS, POLISHING_THREAD_SECONDS = 2e-5, 1.2e-4
+"""Of traversal, bounds and checks for one polygon, and of polishing it; measured on a server of two cores."""
 
-BYTES = 800
-"""Of memory at the peak for one polygon."""
+BYTES, POLISHING_BYTES = 800, 2000
+"""Of memory at the peak for one polygon, and what polishing adds."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,14 +59,17 @@ class Fineness:
     forecast: Forecast
     limit: float
 
-    def cost(self, threads: int) -> str:
-        """What the extraction is expected to cost on ``threads`` threads, a sentence."""
+    def cost(self, threads: int, *, polish: bool = False) -> str:
+        """What the extraction is expected to cost on ``threads`` threads, a sentence; with ``polish``, of that too."""
         pieces = self.forecast.pieces
-        seconds = max(1.0, pieces * THREAD_SECONDS / threads)
+        of_each = THREAD_SECONDS + POLISHING_THREAD_SECONDS * polish
+        size = pieces * (BYTES + POLISHING_BYTES * polish) / 1e9
+        seconds = max(1.0, pieces * of_each / threads)
         time = f"{seconds:.0f} s" if seconds < 120 else f"{seconds / 60:.0f} min"
         fineness = "" if self.knots_per_period is None else f" at {self.knots_per_period:.3g} knots per period"
         excess = f" (beyond {self.limit:,.0f})" if pieces > self.limit else ""
-        return f"about {pieces:,.0f} polygons{excess}{fineness}: about {time} and {pieces * BYTES / 1e9:.1f} GB"
+        polishing = " with polishing, which divides them" if polish else ""
+        return f"about {pieces:,.0f} polygons{excess}{fineness}: about {time} and {size:.1f} GB{polishing}"
 
 
 def canonical_within_budget(

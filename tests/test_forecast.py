@@ -111,6 +111,8 @@ def test_more_than_the_usual_number_of_polygons_is_said(monkeypatch: pytest.Monk
     assert fineness is not None
     assert fineness.forecast.pieces > usual
     assert f"(beyond {usual:,.0f})" in fineness.cost(1)
+    assert "polishing" not in fineness.cost(1)
+    assert fineness.cost(1, polish=True).endswith("with polishing, which divides them")
 
 
 def test_surrogates_are_finer_than_usual_where_the_topology_asks_for_it(monkeypatch: pytest.MonkeyPatch) -> None:
