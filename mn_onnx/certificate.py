@@ -23,6 +23,10 @@ SHALLOW = 0.1
 VAGUE = 0.05
 """A displacement bound above this part of the largest side of the box says nothing of where the surface is."""
 
+PLACED = 1e-9
+"""Vertices are on the level set of the surrogates up to much less than this part of the box: rounding, and what
+coincides becomes one."""
+
 ANGLE_SAMPLES = 1 << 14
 
 CLOSE_ENOUGH = 1.2
@@ -59,15 +63,15 @@ def _with_errors(
     """The surface with the proved errors of its polygons, of which ``most`` is another bound, and what they come to."""
     side = float((canonical.upper - canonical.lower).max())
     errors = surface_errors(canonical.network, surface, canonical.lower, canonical.upper, threads=threads)
-    errors = np.minimum(errors, most)
     slopes = np.sqrt((surface.gradients**2).sum(axis=1))
+    errors = np.minimum(errors, most + PLACED * side * slopes)
     steep = slopes > SHALLOW * np.median(slopes)
     displacement = errors / np.maximum(slopes, np.finfo(np.float64).tiny)
     attributes = {**surface.attributes, "eps": errors, "displacement": displacement}
     return replace(surface, errors=errors, attributes=attributes), {
         "surface_eps": float(errors.max()),
         "surface_eps_median": float(np.median(errors)),
-        "displacement": float(displacement[steep].max()),
+        "displacement": float(displacement[steep].max(initial=0.0)),
         "displacement_median": float(np.median(displacement)),
         "shallow_polygons": int(np.count_nonzero(~steep)),
         "vague_polygons": int(np.count_nonzero(displacement > VAGUE * side)),
@@ -79,7 +83,8 @@ def _gradient_angles(surface: Surface, network: Network) -> dict[str, float]:
     points, polygons = sample_surface(surface, ANGLE_SAMPLES)
     true, found = gradient(network, points, true_functions=True), surface.gradients[polygons]
     lengths = np.sqrt((true**2).sum(axis=1) * (found**2).sum(axis=1))
-    cosines = np.einsum("ij,ij->i", true, found) / np.where(lengths > 0, lengths, 1.0)
+    # Without a gradient nothing is known: such places count as turned.
+    cosines = np.nan_to_num(np.einsum("ij,ij->i", true, found) / np.where(lengths > 0, lengths, 1.0))
     return {
         "gradient_angle_median": float(np.degrees(np.arccos(np.clip(np.median(cosines), -1.0, 1.0)))),
         "turned_share": float((cosines <= 0).mean()),

@@ -11,7 +11,7 @@ from mn_onnx.errors import CheckFailed, UsageError
 from mn_onnx.extract.invariants import check_invariants
 from mn_onnx.extract.pipeline import extract_surface
 from mn_onnx.extract.surface import Surface
-from mn_onnx.memory import POLISHING_BYTES
+from mn_onnx.memory import POLISHED_BYTES
 from mn_onnx.model import LoadOptions, Model
 from mn_onnx.progress import ProgressCallback
 from mn_onnx.reader import ModelSource
@@ -38,7 +38,8 @@ def extract(
     ``threads``: all cores by default; the mesh does not depend on it. ``check``: compare the imported network with
     onnxruntime before, and measure the mesh after. ``max_memory``: most bytes that the process may occupy, by default
     what it has and 80 % of what is available. ``polish``: move the vertices of a smooth network's mesh onto the level
-    set of the true network; the topology stays. ``progress``: called with a `ProgressEvent` a few times a second.
+    set of the true network, and divide faces that are too coarse for it; the topology stays. ``progress``: called with
+    a `ProgressEvent` a few times a second.
 
     Returns a `Surface`: ``vertices`` float64 [v, 3], polygons oriented towards growing f, and ``report``, whose keys
     `mn_onnx.report` lists. ``errors`` are proved bounds on |f_true - level| on each polygon, zero for exact networks.
@@ -60,17 +61,18 @@ def extract(
     surface, residuals = found.surface, None
     with phases.phase("check"):
         invariants = check_invariants(surface, bounds=model.bounds)
-        if check and surface.n_polygons and invariants.area > 0:
+        measurable = surface.n_polygons > 0 and invariants.area > 0
+        if check and measurable:
             residuals = measure_residuals(model, surface, run.runtime)
     certificate, polish_entries, smooth_notes = dict[str, Any](NOT_CERTIFIED), None, list[str]()
-    if not model.exact and surface.n_polygons:
+    if not model.exact and measurable:
         with phases.phase("certify"):
             surface, certificate = certified(surface, model.canonical, threads=threads)
             smooth_notes = topology_notes(certificate)
-    if polish and not model.exact and surface.n_polygons:
+    if polish and not model.exact and measurable:
         with phases.phase("polish"):
             before = true_residuals(model, surface)
-            room = run.limit.room(POLISHING_BYTES)
+            room = run.limit.room(POLISHED_BYTES)
             surface, polish_entries = polished(surface, model.canonical, threads=threads, more_polygons=room)
             polish_entries |= {f"{name}_before": value for name, value in before.items()}
             polish_entries |= true_residuals(model, surface)

@@ -16,7 +16,7 @@ SAFE_SHARE = 0.8
 WELDING_BYTES = 80
 """Bytes per polygon corner that a process grows by after the traversal: measured, 49 to weld and up to 75 to check."""
 
-POLISHING_BYTES = 700
+POLISHED_BYTES = 700
 """Bytes per polygon that a process grows by while faces are divided: measured, 600."""
 
 _UNITS = {"": 1, "K": 1000, "M": 1000**2, "G": 1000**3, "T": 1000**4}

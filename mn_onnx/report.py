@@ -6,7 +6,7 @@ Its keys:
 - ``sign``: positive-outside or positive-inside; ``bounds_from``: option, metadata or default;
 - ``exact``, and ``surrogate_eps``: a proved bound on |f_true - f| in the box, zero for exact networks;
 - ``knots_per_period`` and ``forecast_polygons`` of the surrogates, null for exact networks;
-- ``surface_eps``, ``surface_eps_median``: proved bounds of |f_true - f| on the polygons of the mesh; ``displacement``,
+- ``surface_eps``, ``surface_eps_median``: proved bounds of |f_true - level| on the polygons; ``displacement``,
   ``displacement_median``: that over the slope, how far the true level set may be to first order, where the slope is at
   least a tenth of the median one (``shallow_polygons`` are the others); ``vague_polygons``: those with a displacement
   bound above a twentieth of the box, which says nothing; ``gradient_angle_median``, in degrees: between the gradients
@@ -26,8 +26,8 @@ Its keys:
 - ``nodes``; and the counts of `mn_onnx.extract.schedule.TraversalStatistics` under ``traversal``, with the ``profile``
   that `mn_onnx.profile` describes;
 - ``degeneracy``, ``flat_regions``: `Degeneracy` and `FlatRegions`, what was not in general position and what was done;
-- ``seconds``: import, lower, compile (loading or compiling the kernels), traverse, weld, check, write; flat (looking
-  for regions of zeros), and perturb where planes coincide;
+- ``seconds``: import, lower, compile (loading or compiling the kernels), traverse, weld, certify, polish, check, write;
+  flat (looking for regions of zeros), and perturb where planes coincide;
 - ``problems``: what failed, ``notes``: what is legal but worth knowing.
 """
 

@@ -28,7 +28,7 @@ def mesh_summary(mesh: str, report: dict[str, Any]) -> str:
     if not report["exact"]:
         lines.append(_surrogate_line(report))
     if report.get("surface_eps") is not None:
-        lines.append(f"  on the mesh |f_true - f| is {_certificate(report)}")
+        lines.append(f"  on the mesh |f_true| is {_certificate(report)}")
     if report.get("polish") is not None:
         lines.append(_polish_line(report["polish"]))
         lines.append(f"  on the polished mesh |f_true| is {_certificate(report['polish'])}")
@@ -84,7 +84,7 @@ def _polish_line(polish: dict[str, Any]) -> str:
         ("divided_polygons", "polygons divided to come closer"),
         ("held_vertices", "vertices held back so that no face turns over"),
         ("stray_vertices", "vertices found no root in reach"),
-        ("reversed_polygons", "polygons face against the true gradient, as they did before"),
+        ("reversed_polygons", "polygons face against the true gradient, parts of some that did before"),
     )
     told = "".join(f"; {polish[key]:,} {what}" for key, what in counts if polish[key])
     return (

@@ -44,11 +44,14 @@ def test_bounds_hold_and_are_close(function: Expression, knots: float) -> None:
     assert np.median(errors / seen) < 10
 
 
-def test_threads_do_not_change_bounds() -> None:
+def test_threads_do_not_change_bounds(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("mn_onnx.extract.smooth.face_errors.BLOCK", 64)
     low, high = SMALL_BOX
-    canonical, surface = extracted(dense([5, 4], SINE, seed=3), knots=4, lower=low, upper=high)
-    one, two = (surface_errors(canonical.network, surface, low, high, threads=threads) for threads in (1, 2))
-    np.testing.assert_array_equal(one, two)
+    canonical, surface = extracted(dense([37, 35], SINE, seed=3), knots=2.5, lower=0.4 * low, upper=0.4 * high)
+    assert surface.n_polygons > 64 * 16
+    found = [surface_errors(canonical.network, surface, low, high, threads=threads) for threads in (1, 2, 3)]
+    np.testing.assert_array_equal(found[0], found[1])
+    np.testing.assert_array_equal(found[0], found[2])
 
 
 def test_exact_networks_have_no_error() -> None:

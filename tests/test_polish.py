@@ -18,6 +18,7 @@ from mn_onnx.extract.smooth.polish import FLATNESS, polish
 from mn_onnx.extract.surface import Surface
 from mn_onnx.extraction import extract
 from mn_onnx.ir.evaluate import evaluate, gradient
+from mn_onnx.ir.expression import T, apply, constant
 from mn_onnx.ir.network import AffineRow, Network
 from mn_onnx.model import Model, load
 
@@ -122,6 +123,52 @@ def test_vertices_on_the_box_stay_on_its_faces() -> None:
             np.testing.assert_array_equal(surface.vertices[tails, axis], side)
     assert after.report["problems"] == []
     assert after.report["polish"]["mean_abs_f"] < 1e-10
+
+
+def test_vertices_that_slide_stay_in_the_box() -> None:
+    """Faces that fold beside the box, whose vertices slide along the surface to turn them back."""
+    network, low, high = dense([8, 8], SINE, seed=0), 0.3 * LOW, 0.3 * HIGH
+    canonical, surface = extracted(network, knots=4, lower=low, upper=high)
+    moved, result = polish(surface, canonical.network, low, high, threads=1, flatness=ONLY_VERTICES)
+    assert result.slid_vertices > 0
+    assert (moved.vertices >= low).all()
+    assert (moved.vertices <= high).all()
+
+
+def test_threads_do_not_change_the_mesh(before: Surface, model: Model, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("mn_onnx.extract.smooth.projection.BLOCK", 200)
+    monkeypatch.setattr("mn_onnx.ir.evaluator.CHUNK", 1 << 10)
+    meshes = [polish(before, model.network, LOW, HIGH, threads=threads, flatness=1e-4)[0] for threads in (1, 2, 3)]
+    assert meshes[0].n_vertices > 200 * 16
+    for mesh in meshes[1:]:
+        np.testing.assert_array_equal(meshes[0].vertices, mesh.vertices)
+        np.testing.assert_array_equal(meshes[0].corners, mesh.corners)
+
+
+def test_a_function_without_a_gradient_in_places_is_polished_elsewhere() -> None:
+    root = apply("sqrt", apply("maximum", T, constant(0.0)))
+    canonical, surface = extracted(dense([6], root, seed=2), knots=6)
+    moved, entries = polished(surface, canonical, threads=1)
+    assert np.isfinite(entries["wanted_mean_abs_f"])
+    assert entries["mean_abs_f"] < 0.1 * entries["mean_abs_f_before"]
+    assert np.isfinite(moved.vertices).all()
+    assert 0 <= certified(surface, canonical, threads=1)[1]["turned_share"] <= 1
+
+
+def test_nothing_cannot_be_polished(before: Surface, model: Model) -> None:
+    nothing = replace(
+        before,
+        vertices=np.zeros((0, 3)),
+        offsets=np.zeros(1, np.int64),
+        corners=before.corners[:0],
+        twins=before.twins[:0],
+        box_faces=before.box_faces[:0],
+        gradients=before.gradients[:0],
+        errors=before.errors[:0],
+        attributes={},
+    )
+    with pytest.raises(ValueError, match="without polygons"):
+        polish(nothing, model.network, LOW, HIGH, threads=1)
 
 
 def test_no_face_turns_over(model: Model, before: Surface) -> None:

@@ -43,15 +43,15 @@ WORTH = 0.25
 
 def divide(
     surface: Surface, projection: Projection, wanted: float, most_polygons: float, threads: int
-) -> tuple[Surface, int, int]:
+) -> tuple[Surface, int]:
     """Divide faces until the mean |f| over them is ``wanted``, or they are about ``most_polygons``.
 
     ``surface``, with vertices as in ``projection``, which are brought up to date. Faces with a vertex that is not on
-    the level set are left alone: dividing them brings them no closer. Returns the surface, how many faces were divided,
-    and how many new vertices were held back so that no face turns over.
+    the level set are left alone: dividing them brings them no closer. Returns the surface, and how many faces were
+    divided.
     """
     most = min(max(MOST_GROWTH * surface.n_polygons, SMALL), most_polygons)
-    n_divided = n_held = 0
+    n_divided = 0
     # f in the middle of each face, NaN where it is not evaluated, and its foretold size, NaN where it must be.
     middle, foretold = np.full(surface.n_polygons, np.nan), np.full(surface.n_polygons, np.nan)
     limit = 0.0
@@ -75,26 +75,25 @@ def divide(
         if not chosen.size:
             break
         division = subdivide(surface, chosen, projection.free, projection.gradients, threads)
-        surface, moved, held = _project(division, middle, projection, threads)
+        surface, moved = _project(division, middle, projection, threads)
         heights[chosen] *= PART
         foretold, middle = heights[division.parents], middle[division.parents]
         middle[~division.whole] = np.nan
         touched = np.logical_or.reduceat(moved[surface.corners], surface.offsets[:-1])
         middle[touched] = foretold[touched] = np.nan
         n_divided += int(chosen.size)
-        n_held += held
         if full:
             break
-    return surface, n_divided, n_held
+    return surface, n_divided
 
 
 def _project(
     division: Division, middle: Floats, projection: Projection, threads: int
-) -> tuple[Surface, NDArray[np.bool_], int]:
+) -> tuple[Surface, NDArray[np.bool_]]:
     """Bring the new vertices onto the level set.
 
-    ``middle``: [p], f in the middle of each of the polygons before. Returns the surface, bool [v] which vertices slid
-    or were held back, and how many were held back.
+    ``middle``: [p], f in the middle of each of the polygons before. Returns the surface, and bool [v] which vertices
+    slid or were held back.
     """
     surface = division.surface
     new = np.flatnonzero(division.order >= len(projection.values))
@@ -106,7 +105,7 @@ def _project(
     slid, held = turn_back(surface, projection, upright, np.flatnonzero(~division.whole), threads)
     moved = np.zeros(surface.n_vertices, bool)
     moved[slid] = moved[held] = True
-    return replace(surface, vertices=projection.positions.copy()), moved, int(held.size)
+    return replace(surface, vertices=projection.positions.copy()), moved
 
 
 def _to_divide(moments: Floats, wanted: float) -> tuple[Integers, float]:
@@ -118,7 +117,8 @@ def _to_divide(moments: Floats, wanted: float) -> tuple[Integers, float]:
     order = np.argsort(-moments, kind="stable").astype(np.int64)
     falling = moments[order]
     sums = np.concatenate([np.zeros(1), np.cumsum(falling)])
-    if sums[-1] <= wanted:
+    # Not so also where a moment is not a number.
+    if not sums[-1] > wanted or falling[0] * LEAST_LIMIT <= np.finfo(np.float64).tiny:
         return order[:0], 0.0
     parts = PART / 4.0
 

@@ -58,8 +58,8 @@ def polygon_errors(
 
     ``vertices``: float64 [v, d], d the dimension of the network; polygon ``i`` is the convex hull of
     ``vertices[corners[offsets[i]:offsets[i + 1]]]`` (two of them for a segment). ``lower``, ``upper``: float64 [d], the
-    box that the network was canonicalised for. Bounds are closest, and found fastest, where polygons that follow one
-    another are close to one another. Raises ``ValueError`` for a network without tables.
+    box that the network was canonicalised for, in which the vertices are. Bounds are closest, and found fastest, where
+    polygons that follow one another are close to one another. Raises ``ValueError`` for a network without tables.
     """
     errors = np.zeros(offsets.size - 1)
     if not any(unit.table is None or unit.table.errors.any() for unit in network.units) or not errors.size:
@@ -77,13 +77,15 @@ def polygon_errors(
     size, enough = _patch_size(bound, polygons, order, errors)
 
     def work(first: int, last: int) -> None:
-        end = min(last * BLOCK, errors.size)
-        begins = np.arange(first * BLOCK, end, size)
-        ends = np.minimum(begins + size, end)
-        while begins.size:
-            radii = bound(polygons, order, begins, ends, errors)
-            divided = (radii > enough) & (ends > begins + 1)
-            begins, ends = _halves(begins[divided], ends[divided])
+        # Each block by itself: what is multiplied together, and so its rounding, does not depend on the threads.
+        for block in range(first, last):
+            end = min((block + 1) * BLOCK, errors.size)
+            begins = np.arange(block * BLOCK, end, size)
+            ends = np.minimum(begins + size, end)
+            while begins.size:
+                radii = bound(polygons, order, begins, ends, errors)
+                divided = (radii > enough) & (ends > begins + 1)
+                begins, ends = _halves(begins[divided], ends[divided])
 
     run_matrix_blocks(work, n_blocks, threads)
     return errors

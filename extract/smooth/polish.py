@@ -40,7 +40,7 @@ class Polish:
     turn a face back. ``held_vertices``: those left short of the level set so that no face turns over.
     ``stray_vertices``: others that found no root within their reach. ``turned_polygons``, ``turned_area_share``: before
     it, the polygons whose gradient is more than 90 degrees from the true one; near these the topology need not be that
-    of the true level set. ``reversed_polygons``: those among them that face against the true gradient afterwards.
+    of the true level set. ``reversed_polygons``: those that face against the true gradient afterwards, parts of these.
     ``divided_polygons``: how many were divided to come closer to the curved level set; ``wanted_mean_abs_f``: the mean
     |f| over the faces that this was to reach.
     """
@@ -77,9 +77,11 @@ def polish(
     ``surface``: the level set of canonical ``network`` in the box ``lower``..``upper`` (float64 [3]). ``flatness``:
     faces are divided until their mean |f| is this part of the typical slope times half of the box (infinite: none
     is) or there are about ``most_polygons``. The polygons of the result need not be flat; their gradients are those of
-    the true network, interpolated where faces were divided; ``errors`` and attributes are those of the polygons they
-    come from.
+    the true network a short step from the corners, or interpolated where faces were divided; ``errors`` and attributes
+    are those of the polygons they come from. Raises ValueError for a surface without polygons.
     """
+    if not surface.n_polygons:
+        raise ValueError("a surface without polygons has no vertices to move")
     threads = resolve_threads(threads)
     lower, upper = np.asarray(lower, np.float64), np.asarray(upper, np.float64)
     projection = Projection.of(surface, TrueField(network, threads), lower, upper)
@@ -87,15 +89,13 @@ def polish(
     everywhere = np.arange(surface.n_polygons)
     upright = facing(surface.vertices, projection.gradients, surface.offsets, surface.corners, everywhere) > 0
     projection.project(np.arange(surface.n_vertices))
-    slid, held = turn_back(surface, projection, upright, everywhere, threads)
-    stray = ~projection.settled()
-    stray[held] = False
+    slid, _ = turn_back(surface, projection, upright, everywhere, threads)
     moves = projection.positions - surface.vertices
     largest_move = float(np.sqrt((moves**2).sum(axis=1)).max())
     del moves
     moved = replace(surface, vertices=projection.positions.copy())
     wanted = flatness * projection.slope * 0.5 * float((upper - lower).max())
-    result, divided, held_new = divide(moved, projection, wanted, most_polygons, threads)
+    result, divided = divide(moved, projection, wanted, most_polygons, threads)
     result, reversed_polygons = _with_gradients(result, projection)
     after = np.abs(projection.values)
     areas = surface.measures.areas
@@ -108,8 +108,8 @@ def polish(
         vertices_within_1e_9=int(np.count_nonzero(after <= 1e-9)),
         largest_move=largest_move,
         slid_vertices=int(slid.size),
-        held_vertices=int(held.size) + held_new,
-        stray_vertices=int(np.count_nonzero(stray)),
+        held_vertices=int(np.count_nonzero(projection.held)),
+        stray_vertices=int(np.count_nonzero(~projection.settled() & ~projection.held)),
         turned_polygons=int(np.count_nonzero(~upright)),
         turned_area_share=float(areas[~upright].sum() / max(areas.sum(), np.finfo(np.float64).tiny)),
         reversed_polygons=reversed_polygons,

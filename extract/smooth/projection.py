@@ -9,6 +9,7 @@ stay on them.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -69,23 +70,31 @@ class TrueField:
         """``f`` at ``points`` [n, 3], float64 [n]."""
         result = np.empty(len(points))
 
-        def work(first: int, last: int) -> None:
-            part = slice(first * BLOCK, last * BLOCK)
+        def work(part: slice) -> None:
             result[part] = self._evaluator.values(points[part])
 
-        run_matrix_blocks(work, -(-len(points) // BLOCK), self._threads)
+        self._by_blocks(work, len(points))
         return result
 
     def values_and_gradients(self, points: Floats) -> tuple[Floats, Floats]:
-        """``f`` and its gradient at ``points`` [n, 3], float64 [n] and [n, 3]."""
+        """``f`` and its gradient at ``points`` [n, 3], float64 [n] and [n, 3]; zero where there is no gradient."""
         values, gradients = np.empty(len(points)), np.empty((len(points), 3))
 
-        def work(first: int, last: int) -> None:
-            part = slice(first * BLOCK, last * BLOCK)
+        def work(part: slice) -> None:
             values[part], gradients[part] = self._evaluator.values_and_gradients(points[part])
 
-        run_matrix_blocks(work, -(-len(points) // BLOCK), self._threads)
+        self._by_blocks(work, len(points))
+        gradients[~np.isfinite(gradients).all(axis=1)] = 0.0
         return values, gradients
+
+    def _by_blocks(self, work: Callable[[slice], None], n_points: int) -> None:
+        """Each block by itself: what is evaluated together, and so its rounding, does not depend on the threads."""
+
+        def blocks(first: int, last: int) -> None:
+            for block in range(first, last):
+                work(slice(block * BLOCK, (block + 1) * BLOCK))
+
+        run_matrix_blocks(blocks, -(-n_points // BLOCK), self._threads)
 
 
 @dataclass(eq=False)
@@ -93,7 +102,8 @@ class Projection:
     """Vertices on their way onto the level set. ``positions`` [v, 3], ``values`` [v]: where they are, and ``f`` there.
 
     ``gradients`` [v, 3]: of ``f``, a short step away, or means of those of neighbours. ``free`` bool [v, 3]: the axes
-    along which a vertex may move. ``slope``: the typical one.
+    along which a vertex may move. ``held`` bool [v]: those held back so that no face turns over. ``slope``: the typical
+    one.
     """
 
     field: TrueField
@@ -103,14 +113,17 @@ class Projection:
     values: Floats
     gradients: Floats
     free: Booleans
+    held: Booleans
     slope: float
 
     @classmethod
     def of(cls, surface: Surface, field: TrueField, lower: Floats, upper: Floats) -> Projection:
         """The vertices of ``surface`` where they are."""
         values, gradients = field.values_and_gradients(surface.vertices)
-        slope = float(np.median(_lengths(gradients))) if len(values) else 0.0
-        return cls(field, lower, upper, surface.vertices.copy(), values, gradients, free_axes(surface), slope)
+        lengths = _lengths(gradients)
+        slope = float(np.median(lengths[lengths > 0])) if lengths.any() else 0.0
+        held = np.zeros(len(values), bool)
+        return cls(field, lower, upper, surface.vertices.copy(), values, gradients, free_axes(surface), held, slope)
 
     @property
     def scale(self) -> float:
@@ -142,6 +155,7 @@ class Projection:
 
         self.positions, self.values = merged(self.positions, positions), merged(self.values, values)
         self.gradients, self.free = merged(self.gradients, gradients), merged(self.free, free)
+        self.held = merged(self.held, np.zeros(len(values), bool))
 
     def evaluate(self, vertices: Integers) -> None:
         """Bring values and gradients of ``vertices`` up to date."""

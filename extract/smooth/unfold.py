@@ -126,7 +126,8 @@ def turn_back(
     """Turn back the faces that the projection turned over; returns the vertices that slid, and those held back.
 
     ``surface``: with the vertices where they were before. ``upright``: bool [p], the polygons that faced along the true
-    gradient then; none of them stays turned over. ``polygons``: those with a vertex that was projected.
+    gradient then; none of them stays turned over, save where that gradient was interpolated and is not the true one.
+    ``polygons``: those with a vertex that was projected.
     """
     nobody = np.zeros(0, np.int64)
     folded = polygons[
@@ -138,6 +139,9 @@ def turn_back(
     movable = np.asarray(projection.free.all(axis=1))
 
     def project(vertices: Integers) -> None:
+        # Sliding along the surface may have led out of the box.
+        slid = projection.positions[vertices]
+        projection.positions[vertices] = np.clip(slid, projection.lower, projection.upper)
         projection.evaluate(vertices)
         projection.project(vertices)
 
@@ -159,4 +163,6 @@ def turn_back(
         touched = neighbours.polygons_at(back)
         touched = touched[upright[touched]]
         folded = touched[neighbours.facing(touched, projection.positions, projection.gradients) < 0]
-    return slid, np.flatnonzero(shares < 1.0)
+    held = np.flatnonzero(shares < 1.0)
+    projection.held[held] = True
+    return slid, held

@@ -62,7 +62,14 @@ def derivative(expression: Expression) -> Expression:
 
 
 def _times(a: Expression, b: Expression) -> Expression:
-    return ZERO if ZERO in (a, b) else apply("multiply", a, b)
+    if ZERO in (a, b):
+        return ZERO
+    for factor, other in ((a, b), (b, a)):
+        # Where the derivative inside is zero, that outside may be infinite.
+        if other.op == "where" and ZERO in other.arguments[1:]:
+            condition, *branches = other.arguments
+            return apply("where", condition, *(_times(factor, branch) for branch in branches))
+    return apply("multiply", a, b)
 
 
 def _derivative(expression: Expression) -> Expression:
