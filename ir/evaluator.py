@@ -257,7 +257,9 @@ class Evaluator:
                 slopes = group.function.slopes(t[:, group.positions])
                 slopes *= adjoint[:, group.outputs]
                 _accumulate(of_t, group.positions, slopes)
-            adjoint[:, contiguous(block.columns)] += of_t @ block.weights
+            # A function without a derivative somewhere has NaN there, and so has the gradient.
+            with np.errstate(invalid="ignore"):
+                adjoint[:, contiguous(block.columns)] += of_t @ block.weights
         return adjoint[:, : self.network.input_dim]
 
 

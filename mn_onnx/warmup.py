@@ -5,11 +5,9 @@ from __future__ import annotations
 from contextlib import nullcontext
 
 import numpy as np
-from numba import types
 
 from mn_onnx.extract.blocks import resolve_threads
 from mn_onnx.extract.invariants import check_invariants
-from mn_onnx.extract.kernels.fold import fold
 from mn_onnx.extract.sampling import sample_surface
 from mn_onnx.extract.schedule import traverse
 from mn_onnx.extract.soup import PolygonSoup
@@ -25,7 +23,7 @@ def warm_up(threads: int | None = None) -> Surface:
     """The octahedron |x| + |y| + |z| = 1 / 2; making it goes once through every kernel that extraction and checks need.
 
     Curves and roots need the same ones, as they are extracted in three dimensions. With two of ``threads`` (None: all
-    cores) or more, a second process compiles some of the kernels, if need be, while this one compiles the others.
+    cores) or more, a second process compiles the kernels for meshes, if need be, while this one compiles the others.
     """
     with compiling_beside(__name__) if resolve_threads(threads) > 1 else nullcontext():
         soup, _ = traverse(_octahedral_network(), -np.ones(DIMENSION), np.ones(DIMENSION), threads=1)
@@ -63,13 +61,6 @@ def _octahedral_soup() -> PolygonSoup:
     )
 
 
-def _compile_second_half() -> None:
-    """Folding, which the traversal comes to when about half of it is compiled, and what makes meshes."""
-    floats, integers = types.CPointer(types.float64), types.CPointer(types.int64)
-    fold.compile((floats, integers, floats, integers, *[types.int64] * 6))
-    _meshed(_octahedral_soup())
-
-
 def _meshed(soup: PolygonSoup) -> Surface:
     surface = weld(soup, threads=1)
     check_invariants(surface)
@@ -77,5 +68,7 @@ def _meshed(soup: PolygonSoup) -> Surface:
     return surface
 
 
-if __name__ == "__main__":  # the second process
-    _compile_second_half()
+if __name__ == "__main__":
+    # The second process. It compiles no kernel that the traversal has too: were both to write one to the cache at the
+    # same time, for different types, numba would give both files one name.
+    _meshed(_octahedral_soup())
