@@ -8,17 +8,24 @@ import sys
 from pathlib import Path
 
 VARIABLE = "NUMBA_CACHE_DIR"
+INSTALLED = frozenset(("site-packages", "dist-packages"))
 
 
 def ensure_place_for_kernels(package: Path, user_cache: Path) -> Path | None:
-    """Name a folder to numba if it would have none and fail: returns it, or None where numba finds one by itself.
+    """Name a folder to numba where its own choice would not do: returns it, or None.
 
     numba keeps compiled kernels beside their source in ``package``, else below ``user_cache``, else it raises, as for
-    a service that runs an installation of another user and has no home.
+    a service that runs an installation of another user and has no home. In an installation they would outlast it: pip
+    leaves what it does not know, and folders without sources hide an editable installation that follows.
     """
-    if os.environ.get(VARIABLE) or _takes_files(package / "__pycache__") or _takes_files(user_cache):
+    if os.environ.get(VARIABLE):
         return None
-    folder = _private_folder()
+    if INSTALLED.intersection(package.parts) and _takes_files(user_cache):
+        folder = user_cache / "mn-onnx"
+    elif _takes_files(package / "__pycache__") or _takes_files(user_cache):
+        return None
+    else:
+        folder = _private_folder()
     os.environ[VARIABLE] = str(folder)
     if "numba" in sys.modules:  # it has read the environment already
         sys.modules["numba"].config.CACHE_DIR = str(folder)

@@ -34,6 +34,15 @@ def test_a_folder_that_the_user_names_is_kept(nowhere: Path, monkeypatch: pytest
     assert os.environ[VARIABLE] == "chosen"
 
 
+def test_an_installation_keeps_no_kernels(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(VARIABLE, "")
+    monkeypatch.setattr("numba.config.CACHE_DIR", "")
+    installed, cache = tmp_path / "site-packages" / "mn_onnx", tmp_path / "cache" / "numba"
+    installed.mkdir(parents=True)
+    assert ensure_place_for_kernels(installed, cache) == cache / "mn-onnx"
+    assert os.environ[VARIABLE] == str(cache / "mn-onnx")
+
+
 def test_kernels_are_cached_in_a_private_folder_else(nowhere: Path, tmp_path: Path) -> None:
     folder = ensure_place_for_kernels(nowhere, nowhere)
     assert folder is not None
