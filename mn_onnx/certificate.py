@@ -104,11 +104,11 @@ def topology_notes(certificate: Mapping[str, Any]) -> list[str]:
 
 
 def polished(
-    surface: Surface, canonical: Canonical, *, threads: int | None = None, more_polygons: float = math.inf
+    surface: Surface, canonical: Canonical, *, threads: int | None = None, most_polygons: float = math.inf
 ) -> tuple[Surface, dict[str, Any]]:
     """The surface, one of `certified`, moved onto the level set of the true network, and what that did.
 
-    Faces are divided for it; they do not become more than ``more_polygons`` more. Their errors are proved anew.
+    Faces are divided for it until they are about ``most_polygons``. Their errors are proved anew.
     """
     moved, result = polish(
         surface,
@@ -116,7 +116,7 @@ def polished(
         canonical.lower,
         canonical.upper,
         threads=threads,
-        most_polygons=surface.n_polygons + more_polygons,
+        most_polygons=most_polygons,
     )
     moved, entries = _with_errors(moved, canonical, math.inf, threads)
     return moved, asdict(result) | entries

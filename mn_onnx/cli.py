@@ -111,7 +111,9 @@ def _add_extract(commands: argparse._SubParsersAction[argparse.ArgumentParser]) 
         help="values per face to write (.ply): normals; of smooth networks eps (proved error), displacement",
     )
     parser.add_argument(
-        "--polish", action="store_true", help="move the vertices onto the level set of the true smooth network"
+        "--polish",
+        action="store_true",
+        help="move the vertices onto the level set of the true smooth network, and divide faces too coarse for it",
     )
     parser.add_argument(
         "--all",

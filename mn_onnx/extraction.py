@@ -73,7 +73,7 @@ def extract(
         with phases.phase("polish"):
             before = true_residuals(model, surface)
             room = run.limit.room(POLISHED_BYTES)
-            surface, polish_entries = polished(surface, model.canonical, threads=threads, more_polygons=room)
+            surface, polish_entries = polished(surface, model.canonical, threads=threads, most_polygons=room)
             polish_entries |= {f"{name}_before": value for name, value in before.items()}
             polish_entries |= true_residuals(model, surface)
             smooth_notes += polish_notes(polish_entries)

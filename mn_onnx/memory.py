@@ -17,7 +17,7 @@ WELDING_BYTES = 80
 """Bytes per polygon corner that a process grows by after the traversal: measured, 49 to weld and up to 75 to check."""
 
 POLISHED_BYTES = 700
-"""Bytes per polygon that a process grows by while faces are divided: measured, 600."""
+"""Bytes per polygon of the polished mesh that a process grows by: measured, 600."""
 
 _UNITS = {"": 1, "K": 1000, "M": 1000**2, "G": 1000**3, "T": 1000**4}
 _UNITS |= {f"{letter}i": 1024**power for power, letter in enumerate("KMGT", start=1)}

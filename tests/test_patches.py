@@ -40,6 +40,20 @@ def tables_of(function: ScalarFunction) -> Tables:
     )
 
 
+def test_rounding_of_a_knot_is_no_slope() -> None:
+    """A range around a knot far smaller than what its lines miss each other by."""
+    half, radius = 1e-300, np.zeros((1, 2, 1))
+    tables = Tables(
+        np.array([0, 2]), np.array([-np.inf, 0.0]), np.array([1.0, 2.0]), np.array([0.0, 1e-17]), np.zeros(2)
+    )
+    relaxed = Relaxed(np.empty((1, 1)), np.empty((1, 1)), np.empty((1, 1)))
+    one, limits = np.zeros(1, np.int64), (np.array([-1.0]), np.array([1.0]))
+    form = np.array([[[0.0], [half]]])
+    relax_level(tables, one, one, limits, (form, radius), np.ones((1, 1)), relaxed)
+    assert 1 <= relaxed.slope[0, 0] <= 2
+    assert 0 <= relaxed.error[0, 0] < 1e-15
+
+
 @pytest.mark.parametrize("function", [SINE, SILU, RELU], ids=["sine", "silu", "relu"])
 @pytest.mark.parametrize("width", [1e-9, 1e-3, 0.1, 3.0])
 def test_lines_hold_functions_on_ranges(function: ScalarFunction, width: float) -> None:

@@ -104,7 +104,7 @@ def test_errors_are_proved_of_the_polished_mesh(model: Model) -> None:
 
 def test_a_goal_out_of_reach_is_told(model: Model) -> None:
     before = extract(model, threads=1)
-    coarse, entries = polished(before, model.canonical, threads=1, more_polygons=1000)
+    coarse, entries = polished(before, model.canonical, threads=1, most_polygons=before.n_polygons + 1000)
     assert before.n_polygons < coarse.n_polygons <= before.n_polygons + 1000
     entries |= true_residuals(model, coarse)
     (note,) = polish_notes(entries)

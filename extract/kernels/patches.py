@@ -51,19 +51,6 @@ class Polygons(NamedTuple):
 
 
 @numba.njit(cache=True, nogil=True)
-def polygon_centres(polygons: Polygons, first: int, centres: Floats) -> None:
-    """The mean [n, d] of the corners of each polygon from ``first`` on."""
-    vertices, offsets, corners = polygons.vertices, polygons.offsets, polygons.corners
-    for k in range(centres.shape[0]):
-        begin, end = offsets[first + k], offsets[first + k + 1]
-        for axis in range(vertices.shape[1]):
-            total = 0.0
-            for corner in range(begin, end):
-                total += vertices[corners[corner], axis]
-            centres[k, axis] = total / (end - begin)
-
-
-@numba.njit(cache=True, nogil=True)
 def patch_moments(
     polygons: Polygons, order: NDArray[np.integer], begins: Integers, ends: Integers, centre: Floats, moments: Floats
 ) -> None:
@@ -177,6 +164,11 @@ def relax_level(
                 while k + 1 < end and starts[k + 1] <= b:
                     k += 1
                 slope = ((slopes[k] * b + intercepts[k]) - (slopes[i] * a + intercepts[i])) / (b - a)
+                # On a tiny range that is mostly rounding; the slope of a chord is among those of its pieces.
+                flattest = steepest = slopes[i]
+                for piece in range(i + 1, k + 1):
+                    flattest, steepest = min(flattest, slopes[piece]), max(steepest, slopes[piece])
+                slope = min(max(slope, flattest), steepest)
                 at_a, at_b = (slopes[i] - slope) * a + intercepts[i], (slopes[k] - slope) * b + intercepts[k]
                 least, greatest = min(at_a - errors[i], at_b - errors[k]), max(at_a + errors[i], at_b + errors[k])
                 while k > i:

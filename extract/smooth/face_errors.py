@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 from mn_onnx.extract.blocks import Indices, index_dtype, resolve_threads, run_blocks, run_matrix_blocks
 from mn_onnx.extract.kernels.neighbours import order_by_halves
-from mn_onnx.extract.kernels.patches import Polygons, polygon_centres
+from mn_onnx.extract.kernels.patches import Polygons
+from mn_onnx.extract.smooth.faces import mean_over_corners
 from mn_onnx.extract.smooth.patch_bound import PatchBound
 from mn_onnx.extract.surface import Surface
 from mn_onnx.ir.network import Floats, Integers, Network
@@ -95,9 +96,8 @@ def _order_blocks(polygons: Polygons, first: int, last: int, order: Indices) -> 
     """The polygons of each block so that patches are runs in ``order``."""
     for block in range(first, last):
         begin, end = block * BLOCK, min((block + 1) * BLOCK, order.size)
-        centres, numbers = np.empty((end - begin, polygons.vertices.shape[1])), np.arange(end - begin)
-        polygon_centres(polygons, begin, centres)
-        order_by_halves(centres, numbers)
+        numbers = np.arange(end - begin)
+        order_by_halves(mean_over_corners(*polygons, np.arange(begin, end)), numbers)
         order[begin:end] = begin + numbers
 
 
