@@ -6,10 +6,11 @@ one that depends on the number of threads, so that results are the same for any 
 
 from __future__ import annotations
 
+import functools
 import itertools
 import os
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, wait
 from typing import Any
 
 import numba
@@ -54,14 +55,31 @@ def run_blocks(work: Callable[[int, int], object], n_blocks: int, threads: int) 
         for first, last in ranges:
             work(first, last)
         return
-    with ThreadPoolExecutor(threads) as pool:
-        futures = [pool.submit(work, first, last) for first, last in ranges]
+    waiting = iter(ranges)  # threads take from it in turn: `next` is atomic under the interpreter's lock
+
+    def work_on() -> None:
         try:
-            for future in futures:
-                future.result()
+            for first, last in waiting:
+                work(first, last)
         except BaseException:
-            pool.shutdown(wait=False, cancel_futures=True)
+            list(waiting)  # nothing is left for the other threads
             raise
+
+    helpers = [_helpers(threads - 1).submit(work_on) for _ in range(min(threads, n_tasks) - 1)]
+    try:
+        work_on()
+    finally:
+        # A helper that has not begun is not needed: all ranges are taken.
+        begun = [helper for helper in helpers if not helper.cancel()]
+        wait(begun)
+    for helper in begun:
+        helper.result()
+
+
+@functools.cache
+def _helpers(count: int) -> ThreadPoolExecutor:
+    """Threads that wait for work: starting new ones for every call would take longer than many calls' work."""
+    return ThreadPoolExecutor(count, thread_name_prefix="blocks")
 
 
 def run_matrix_blocks(work: Callable[[int, int], object], n_blocks: int, threads: int) -> None:

@@ -15,6 +15,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from mn_onnx.extract.blocks import run_blocks
 from mn_onnx.extract.kernels import control as entries
 from mn_onnx.extract.kernels import march as kernel
 from mn_onnx.extract.kernels.memory import (
@@ -294,7 +295,7 @@ def traverse(
     if pool.error is not None:
         raise pool.error
     report()
-    return _collect(first), _statistics(workers, pool)
+    return _collect(first, count), _statistics(workers, pool)
 
 
 def _statistics(workers: list[_Worker], pool: _Pool) -> TraversalStatistics:
@@ -315,11 +316,13 @@ def _statistics(workers: list[_Worker], pool: _Pool) -> TraversalStatistics:
     )
 
 
-def _collect(first: _Task) -> PolygonSoup:
+def _collect(first: _Task, threads: int) -> PolygonSoup:
+    """The polygons of all tasks, taken out of them."""
     chunks: list[_Chunk] = []
     task: _Task | None = first
     while task is not None:
         chunks.extend(task.chunks)
+        task.chunks.clear()
         task = task.following
     polygons = sum(chunk.sizes.size for chunk in chunks)
     corners = sum(chunk.box_faces.size for chunk in chunks)
@@ -332,17 +335,23 @@ def _collect(first: _Task) -> PolygonSoup:
         np.empty((polygons, 3)),
         np.zeros(polygons),
     )
-    p = c = 0
+    first_polygons = np.cumsum([0, *(chunk.sizes.size for chunk in chunks)])
+    first_corners = np.cumsum([0, *(chunk.box_faces.size for chunk in chunks)])
+
     # Chunks are released one by one, so that the soup and they are never held twice.
-    chunks.reverse()
-    while chunks:
-        chunk = chunks.pop()
-        q, d = p + chunk.sizes.size, c + chunk.box_faces.size
-        np.cumsum(chunk.sizes, out=offsets[p + 1 : q + 1])
-        offsets[p + 1 : q + 1] += c
-        soup.gradients[p:q] = chunk.gradients
-        soup.positions[c:d] = chunk.positions
-        soup.keys[c:d] = chunk.keys.view(np.uint64)
-        soup.box_faces[c:d] = chunk.box_faces
-        p, c = q, d
+    left = dict(enumerate(chunks))
+    del chunks
+
+    def place(begin: int, end: int) -> None:
+        for number in range(begin, end):
+            chunk, p, c = left.pop(number), first_polygons[number], first_corners[number]
+            q, d = first_polygons[number + 1], first_corners[number + 1]
+            np.cumsum(chunk.sizes, out=offsets[p + 1 : q + 1])
+            offsets[p + 1 : q + 1] += c
+            soup.gradients[p:q] = chunk.gradients
+            soup.positions[c:d] = chunk.positions
+            soup.keys[c:d] = chunk.keys.view(np.uint64)
+            soup.box_faces[c:d] = chunk.box_faces
+
+    run_blocks(place, len(left), threads)
     return soup
