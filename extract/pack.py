@@ -17,12 +17,14 @@ from mn_onnx.extract.kernels.memory import (
     CELL_SYSTEM_F,
     CELL_SYSTEM_I,
     CELL_VERTICES,
+    ROW_FLOATS,
     SYS_COLS,
     SYS_FLOATS,
     SYS_HEADER,
     SYS_INTS,
     SYS_LEVELS,
     SYS_ROWS,
+    SYS_SINGLE,
     SYS_UNITS,
     system_floats,
     system_ints,
@@ -110,17 +112,15 @@ def _pack_tables(network: Network, order: Integers, extent: float) -> Tables:
         tag_hash,
         n_knots,
         extent,
-        _two_pieces(tables),
     )
 
 
-def _two_pieces(tables: list[KnotTable]) -> Floats:
-    lines = np.zeros((len(tables), 8))
-    for line, table in zip(lines, tables, strict=True):
-        if table.slopes.shape == (1, 2):
-            (left, right), (left_at, right_at) = table.slopes[0], table.intercepts[0]
-            line[:6] = table.knots[0], left, left_at, right, right_at, 1.0
-    return lines
+def _two_pieces(table: KnotTable) -> Floats:
+    """Knot, left slope and intercept, right slope and intercept of a unit with one knot and one output; else NaN."""
+    if table.slopes.shape != (1, 2):
+        return np.full(ROW_FLOATS - DIMENSIONS - 1, np.nan)
+    (left, right), (left_at, right_at) = table.slopes[0], table.intercepts[0]
+    return np.array([table.knots[0], left, left_at, right, right_at])
 
 
 def _pack_system(network: Network, order: Integers) -> tuple[Floats, Integers]:
@@ -148,12 +148,16 @@ def _pack_system(network: Network, order: Integers) -> tuple[Floats, Integers]:
         col_of_variable[first : first + unit.n_outputs] = row_col[row_of_unit[g]] + np.arange(unit.n_outputs)
 
     affine = np.zeros((4, rows))
+    pieces = np.zeros((ROW_FLOATS - 4, rows))
+    pieces[0] = np.inf
     weights = np.zeros((cols, rows))
     for g, unit in enumerate(network.units):
         r = row_of_unit[g]
         inside = unit.row.columns < network.input_dim
         affine[unit.row.columns[inside], r] = unit.row.weights[inside]
         affine[3, r] = unit.row.bias
+        if unit.table is not None:
+            pieces[:, r] = _two_pieces(unit.table)
         weights[col_of_variable[unit.row.columns[~inside]], r] = unit.row.weights[~inside]
     out_weights = np.zeros(-(-cols // WIDTH) * WIDTH)
     out_affine = np.zeros(4)
@@ -168,8 +172,9 @@ def _pack_system(network: Network, order: Integers) -> tuple[Floats, Integers]:
     header[SYS_ROWS], header[SYS_COLS], header[SYS_LEVELS] = rows, cols, n_levels
     header[SYS_FLOATS], header[SYS_INTS] = system_floats(rows, cols), system_ints(rows, cols, n_levels)
     header[SYS_UNITS] = order.size
+    header[SYS_SINGLE] = (outputs[row_of_unit] == 1).all()
     integers = np.concatenate([header, np.array(starts, np.int64), row_unit, row_col, col_row, begin, end])
-    floats = np.concatenate([affine.reshape(-1), weights.reshape(-1), out_weights, out_affine])
+    floats = np.concatenate([affine.reshape(-1), pieces.reshape(-1), weights.reshape(-1), out_weights, out_affine])
     assert (integers.size, floats.size) == (header[SYS_INTS], header[SYS_FLOATS])
     return floats, integers
 

@@ -13,6 +13,7 @@ from numba import njit
 from mn_onnx.extract.kernels.error_symbols import pass_errors_on, track_errors
 from mn_onnx.extract.kernels.lanes import (
     fma,
+    halves,
     lane,
     larger,
     load,
@@ -25,20 +26,18 @@ from mn_onnx.extract.kernels.lanes import (
     splat_wide,
     store,
     total,
+    totals,
 )
 from mn_onnx.extract.kernels.memory import (
     CELL_CAPACITY,
     CELL_FLOATS,
     CELL_VERTICES,
     CENTRE_AT,
-    DEAD,
     ERROR,
     GROWTH,
     HIGH,
-    KIND,
     LEVEL_OUTPUT,
     LEVEL_SYMBOL,
-    LINEAR,
     LOW,
     OFFSET,
     OUT_COEF,
@@ -46,59 +45,46 @@ from mn_onnx.extract.kernels.memory import (
     RADIUS,
     READ_AT,
     READ_COLS,
-    READ_ROW,
     SLOPE,
     SYS_COLS,
     SYS_HEADER,
     SYS_LEVELS,
     SYS_ROWS,
-    UNSTABLE,
+    SYS_SINGLE,
     padded,
     symbol_stride,
+    weights_of,
 )
-from mn_onnx.extract.kernels.relax import settle
+from mn_onnx.extract.kernels.settle import AGAIN, FIRST, settle_rows
 
 
 @njit(cache=True, error_model="numpy")
 def row_extremes(F, N, X, M, cell, begin, end):
     """LOW and HIGH of rows ``begin:end`` (multiples of the lane width) over the cell's vertices."""
-    n = N[cell + CELL_VERTICES]
-    x = N[cell + CELL_FLOATS]
-    capacity = N[cell + CELL_CAPACITY]
-    y, z = x + capacity, x + 2 * capacity
-    for r in range(begin, end, 4):
-        c0, c1, c2, c3 = load(X, r), load(X, M + r), load(X, 2 * M + r), load(X, 3 * M + r)
-        low = fma(c0, splat(F[x]), fma(c1, splat(F[y]), fma(c2, splat(F[z]), c3)))
-        high = low
-        for v in range(1, n):
-            value = fma(c0, splat(F[x + v]), fma(c1, splat(F[y + v]), fma(c2, splat(F[z + v]), c3)))
-            low = smaller(value, low)
-            high = larger(value, high)
-        store(X, LOW * M + r, low)
-        store(X, HIGH * M + r, high)
+    r = begin
+    while r + 8 <= end:
+        row_extremes_lanes(splat_wide(0.0), F, N, X, M, cell, r)
+        r += 8
+    if r < end:
+        row_extremes_lanes(splat(0.0), F, N, X, M, cell, r)
 
 
 @njit(cache=True, error_model="numpy")
-def remember_outputs(N, X, J, M, row_col, rows, r, count):
-    """Append the relaxed outputs of row ``r`` that are not identically zero to the list that later rows read.
-
-    Entry ``p``: J[READ_COLS] the column, J[READ_ROW] its row, J[READ_AT] where its weights begin, and five numbers at
-    ``X[OUTPUTS] + 8 p``: the affine form and the half width of y. Returns the new length of the list.
-    """
-    for c in range(N[row_col + r], N[row_col + r + 1]):
-        slope, offset, error = X[SLOPE * M + c], X[OFFSET * M + c], X[ERROR * M + c]
-        J[READ_COLS * M + count] = c
-        J[READ_ROW * M + count] = r
-        J[READ_AT * M + count] = c * rows
-        at = OUTPUTS * M + 8 * count
-        X[at] = slope * X[r]
-        X[at + 1] = slope * X[M + r]
-        X[at + 2] = slope * X[2 * M + r]
-        X[at + 3] = slope * X[3 * M + r] + offset
-        X[at + 4] = abs(slope) * X[GROWTH * M + r] + error
-        # The next output takes the place of one that is identically zero.
-        count += (slope != 0.0) | (offset != 0.0) | (error != 0.0)
-    return count
+def row_extremes_lanes(like, F, N, X, M, cell, r):
+    """`row_extremes` for as many rows from ``r`` on as ``like`` has lanes."""
+    n, x, capacity = N[cell + CELL_VERTICES], N[cell + CELL_FLOATS], N[cell + CELL_CAPACITY]
+    y, z = x + capacity, x + 2 * capacity
+    c0, c1 = load_like(like, X, r), load_like(like, X, M + r)
+    c2, c3 = load_like(like, X, 2 * M + r), load_like(like, X, 3 * M + r)
+    low = fma(c0, splat_like(like, F[x]), fma(c1, splat_like(like, F[y]), fma(c2, splat_like(like, F[z]), c3)))
+    high = low
+    for v in range(1, n):
+        value = fma(c2, splat_like(like, F[z + v]), c3)
+        value = fma(c0, splat_like(like, F[x + v]), fma(c1, splat_like(like, F[y + v]), value))
+        low = smaller(value, low)
+        high = larger(value, high)
+    store(X, LOW * M + r, low)
+    store(X, HIGH * M + r, high)
 
 
 @njit(cache=True, error_model="numpy")
@@ -107,7 +93,7 @@ def read_outputs(F, X, J, M, floats, rows, begin, end, first, count):
 
     Also X[GROWTH], radii that add up whatever the rows read.
     """
-    weights = floats + 4 * rows
+    weights = weights_of(floats, rows)
     outputs = OUTPUTS * M
     places = READ_AT * M
     r = begin
@@ -121,13 +107,13 @@ def read_outputs(F, X, J, M, floats, rows, begin, end, first, count):
         for p in range(first, count):
             at = weights + J[places + p] + r
             w, v = load_wide(F, at), load_wide(F, at + 8)
-            y = outputs + 8 * p
+            y = outputs + p
             y0, y1, y2, y3, y4 = (
                 splat_wide(X[y]),
-                splat_wide(X[y + 1]),
-                splat_wide(X[y + 2]),
-                splat_wide(X[y + 3]),
-                splat_wide(X[y + 4]),
+                splat_wide(X[y + M]),
+                splat_wide(X[y + 2 * M]),
+                splat_wide(X[y + 3 * M]),
+                splat_wide(X[y + 4 * M]),
             )
             c0, d0 = fma(w, y0, c0), fma(v, y0, d0)
             c1, d1 = fma(w, y1, c1), fma(v, y1, d1)
@@ -156,18 +142,18 @@ def read_outputs(F, X, J, M, floats, rows, begin, end, first, count):
 def read_outputs_lanes(like, F, X, J, M, floats, rows, r, first, count):
     """`read_outputs` for as many rows from ``r`` on as ``like`` has lanes."""
     outputs, places = OUTPUTS * M, READ_AT * M
-    weights = floats + 4 * rows + r
+    weights = weights_of(floats, rows) + r
     c0, c1 = load_like(like, F, floats + r), load_like(like, F, floats + rows + r)
     c2, c3 = load_like(like, F, floats + 2 * rows + r), load_like(like, F, floats + 3 * rows + r)
     growth = splat_like(like, 0.0)
     for p in range(first, count):
         w = load_like(like, F, weights + J[places + p])
-        y = outputs + 8 * p
+        y = outputs + p
         c0 = fma(w, splat_like(like, X[y]), c0)
-        c1 = fma(w, splat_like(like, X[y + 1]), c1)
-        c2 = fma(w, splat_like(like, X[y + 2]), c2)
-        c3 = fma(w, splat_like(like, X[y + 3]), c3)
-        growth = fma(magnitude(w), splat_like(like, X[y + 4]), growth)
+        c1 = fma(w, splat_like(like, X[y + M]), c1)
+        c2 = fma(w, splat_like(like, X[y + 2 * M]), c2)
+        c3 = fma(w, splat_like(like, X[y + 3 * M]), c3)
+        growth = fma(magnitude(w), splat_like(like, X[y + 4 * M]), growth)
     store(X, r, c0)
     store(X, M + r, c1)
     store(X, 2 * M + r, c2)
@@ -188,7 +174,7 @@ def bound_units(F, N, X, J, M, tables, cell, system, floats, scratch, tracked):
     row_unit = level_start + levels + 1
     row_col = row_unit + rows
     col_end = row_col + rows + 1 + 2 * cols
-    weights = floats + 4 * rows
+    weights = weights_of(floats, rows)
     stride = symbol_stride(cols, levels)
     errors, carried = scratch, scratch + rows * stride
     read = carried + cols * stride
@@ -207,19 +193,18 @@ def bound_units(F, N, X, J, M, tables, cell, system, floats, scratch, tracked):
                 store(X, RADIUS * M + r, load(X, GROWTH * M + r))
         row_extremes(F, N, X, M, cell, begin, end)
         before = count
-        for r in range(begin, end):
-            if N[row_unit + r] >= 0:
-                kind = settle(N, X, J, M, tables, row_col, r, N[row_unit + r])
-                linear += kind == LINEAR
-                dead += kind == DEAD
-                count = remember_outputs(N, X, J, M, row_col, rows, r, count)
+        new_linear, new_dead, count = settle_rows(
+            F, N, X, J, M, tables, row_unit, row_col, floats, rows, begin, end, FIRST, count
+        )
+        linear += new_linear
+        dead += new_dead
         if tracked:
             pass_errors_on(F, X, J, M, level, before, count, errors, carried, stride)
     return linear, dead
 
 
 @njit(cache=True, error_model="numpy")
-def settle_again(F, N, X, J, M, tables, cell, system):
+def settle_again(F, N, X, J, M, tables, cell, system, floats):
     """After a cell has been trimmed: settle its unstable rows by the centres and radii they had on the whole cell.
 
     Returns how many rows have become LINEAR, and how many DEAD.
@@ -228,13 +213,33 @@ def settle_again(F, N, X, J, M, tables, cell, system):
     row_unit = system + SYS_HEADER + N[system + SYS_LEVELS] + 1
     row_col = row_unit + rows
     row_extremes(F, N, X, M, cell, np.int64(0), rows)
-    linear, dead = 0, 0
-    for r in range(rows):
-        if N[row_unit + r] >= 0 and J[KIND * M + r] == UNSTABLE:
-            kind = settle(N, X, J, M, tables, row_col, r, N[row_unit + r])
-            linear += kind == LINEAR
-            dead += kind == DEAD
+    zero = np.int64(0)
+    linear, dead, _ = settle_rows(F, N, X, J, M, tables, row_unit, row_col, floats, rows, zero, rows, AGAIN, zero)
     return linear, dead
+
+
+@njit(cache=True, error_model="numpy")
+def multiply_columns(F, X, multiplier, column, second, third, fourth, begin, end):
+    """Products of rows ``begin : end`` of X[multiplier] with four columns, F[column] and those so far behind it."""
+    a, b, c, d = splat_wide(0.0), splat_wide(0.0), splat_wide(0.0), splat_wide(0.0)
+    q = begin
+    while q + 8 <= end:
+        m = load_wide(X, multiplier + q)
+        at = column + q
+        a = fma(m, load_wide(F, at), a)
+        b = fma(m, load_wide(F, at + second), b)
+        c = fma(m, load_wide(F, at + third), c)
+        d = fma(m, load_wide(F, at + fourth), d)
+        q += 8
+    a4, b4, c4, d4 = halves(a), halves(b), halves(c), halves(d)
+    if q < end:
+        m = load(X, multiplier + q)
+        at = column + q
+        a4 = fma(m, load(F, at), a4)
+        b4 = fma(m, load(F, at + second), b4)
+        c4 = fma(m, load(F, at + third), c4)
+        d4 = fma(m, load(F, at + fourth), d4)
+    return totals(a4, b4, c4, d4)
 
 
 @njit(cache=True, error_model="numpy")
@@ -245,29 +250,45 @@ def bound_output(F, N, X, M, system, floats):
     col_row = row_col + rows + 1
     col_begin = col_row + cols
     col_end = col_begin + cols
-    weights = floats + 4 * rows
+    weights = weights_of(floats, rows)
     out_weights = weights + cols * rows
     multiplier = OUT_COEF * M  # d output / d pre-activation, per row, along the chords
     zero = splat(0.0)
     for r in range(0, rows, 4):
         store(X, multiplier + r, zero)
+    one, constants, radii = splat(1.0), zero, zero
     radius, constant = 0.0, 0.0
-    for c in range(cols - 1, -1, -1):
-        begin, end = N[col_begin + c], N[col_end + c]
-        column = weights + c * rows
-        even, odd, rest = splat_wide(0.0), splat_wide(0.0), zero
-        q = begin
-        while q + 16 <= end:
-            even = fma(load_wide(X, multiplier + q), load_wide(F, column + q), even)
-            odd = fma(load_wide(X, multiplier + q + 8), load_wide(F, column + q + 8), odd)
-            q += 16
-        while q < end:
-            rest = fma(load(X, multiplier + q), load(F, column + q), rest)
-            q += 4
-        coefficient = F[out_weights + c] + ((total(even) + total(odd)) + total(rest))
-        X[multiplier + N[col_row + c]] += coefficient * X[SLOPE * M + c]
-        constant += coefficient * X[OFFSET * M + c]
-        radius += abs(coefficient) * X[ERROR * M + c]
+    c = cols
+    while c > 0:
+        # Four columns of one level at a time, later ones twice where there are fewer.
+        begin = N[col_begin + c - 1]
+        width = 1
+        while width < 4 and c > width and N[col_begin + c - 1 - width] == begin:
+            width += 1
+        c -= width
+        end = begin
+        for k in range(width):
+            end = max(end, N[col_end + c + k])
+        last = width - 1
+        summed = multiply_columns(
+            F, X, multiplier, weights + c * rows, min(1, last) * rows, min(2, last) * rows, last * rows, begin, end
+        )
+        coefficients = fma(one, summed, load(F, out_weights + c))
+        onward = fma(coefficients, load(X, SLOPE * M + c), zero)
+        if width == 4:
+            constants = fma(coefficients, load(X, OFFSET * M + c), constants)
+            radii = fma(magnitude(coefficients), load(X, ERROR * M + c), radii)
+            row = multiplier + N[col_row + c]
+            if N[system + SYS_SINGLE] and N[col_row + c + 3] - N[col_row + c] == 3:  # four rows in a row
+                store(X, row, fma(one, onward, load(X, row)))
+                continue
+        for k in range(width):
+            X[multiplier + N[col_row + c + k]] += lane(onward, k)
+            if width < 4:
+                constant += lane(coefficients, k) * X[OFFSET * M + c + k]
+                radius += abs(lane(coefficients, k)) * X[ERROR * M + c + k]
+    constant += total(constants)
+    radius += total(radii)
     s0, s1, s2, s3 = zero, zero, zero, zero
     for r in range(0, rows, 4):
         m = load(X, multiplier + r)

@@ -11,184 +11,158 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from mn_onnx.extract.kernels.lanes import splat, store
+from mn_onnx.extract.kernels.lanes import fma, lanes_of, load_wide, splat, splat_wide, store
+from mn_onnx.extract.kernels.layout import lay_out_folded
+from mn_onnx.extract.kernels.masks import (
+    bits_of,
+    both,
+    count_bits,
+    count_up,
+    is_below,
+    load_integers,
+    mask_of,
+    pack_store,
+    same,
+    splat_integer,
+    without,
+)
 from mn_onnx.extract.kernels.memory import (
+    COL_KIND,
+    KEPT,
     KEPT_ROWS,
-    KIND,
-    NEW_INDEX,
     OFFSET,
+    OLD_COL,
+    PLACE,
+    ROW_FLOATS,
+    SETTLED_ROW,
+    SETTLED_SLOPE,
     SLOPE,
     STABLE_COLS,
-    STATE_HIGH,
-    STATE_LOW,
     SYS_COLS,
     SYS_FLOATS,
-    SYS_HASH,
     SYS_HEADER,
-    SYS_INTS,
     SYS_LEVELS,
     SYS_ROWS,
-    SYS_UNITS,
     UNSTABLE,
     padded,
     system_floats,
-    system_ints,
+    weights_of,
 )
 from mn_onnx.extract.kernels.products import accumulate, accumulate_four
 
-
-@njit(cache=True, error_model="numpy")
-def lay_out_folded(N, J, M, system, folded, least):
-    """Write the integer part of the system that keeps the rows of kind ``least`` or more, at ``folded``.
-
-    J[KEPT_ROWS] gives the old row of every new one, repeated where padded, J[NEW_INDEX] the new row of every old one
-    (of one that is left out: of the next). Returns the new numbers of rows and columns.
-    """
-    rows, levels = N[system + SYS_ROWS], N[system + SYS_LEVELS]
-    level_start = system + SYS_HEADER
-    row_unit = level_start + levels + 1
-    row_col = row_unit + rows
-    new_rows, new_cols, new_levels, new_units = np.int64(0), np.int64(0), np.int64(0), 0
-    new_level_start = folded + SYS_HEADER
-    N[new_level_start] = 0
-    for level in range(levels):
-        begin = new_rows
-        for r in range(N[level_start + level], N[level_start + level + 1]):
-            J[NEW_INDEX * M + r] = new_rows
-            if N[row_unit + r] >= 0 and J[KIND * M + r] >= least:
-                J[KEPT_ROWS * M + new_rows] = r
-                new_rows += 1
-                new_units += 1
-                new_cols += N[row_col + r + 1] - N[row_col + r]
-        if new_rows > begin:
-            while new_rows & 3:
-                # Padding repeats a row: finite, and read by nothing.
-                J[KEPT_ROWS * M + new_rows] = J[KEPT_ROWS * M + new_rows - 1]
-                new_rows += 1
-            new_levels += 1
-            N[new_level_start + new_levels] = new_rows
-    N[folded + SYS_ROWS] = new_rows
-    N[folded + SYS_COLS] = new_cols
-    N[folded + SYS_LEVELS] = new_levels
-    N[folded + SYS_FLOATS] = system_floats(new_rows, new_cols)
-    N[folded + SYS_INTS] = system_ints(new_rows, new_cols, new_levels)
-    N[folded + SYS_UNITS] = new_units
-    new_unit = new_level_start + new_levels + 1
-    new_row_col = new_unit + new_rows
-    col_row = new_row_col + new_rows + 1
-    col_begin = col_row + new_cols
-    col_end = col_begin + new_cols
-    old_col_end = row_col + rows + 1 + 2 * N[system + SYS_COLS]
-    c = 0
-    level = 0
-    for q in range(new_rows):
-        if q == N[new_level_start + level + 1]:
-            level += 1
-        N[new_row_col + q] = c
-        r = J[KEPT_ROWS * M + q]
-        real = q == 0 or r != J[KEPT_ROWS * M + q - 1]
-        N[new_unit + q] = N[row_unit + r] if real else -1
-        if real:
-            for old in range(N[row_col + r], N[row_col + r + 1]):
-                N[col_row + c] = q
-                N[col_begin + c] = N[new_level_start + level + 1]
-                end = N[old_col_end + old]
-                if least == UNSTABLE or end == rows:
-                    N[col_end + c] = new_rows  # substitution fills the column
-                else:
-                    N[col_end + c] = max(padded(J[NEW_INDEX * M + end]), N[col_begin + c])
-                c += 1
-    N[new_row_col + new_rows] = c
-    return new_rows, new_cols
+# `gather_column` writes up to so many numbers after the last one.
+OVERWRITTEN = 8
 
 
 @njit(cache=True, error_model="numpy")
 def list_settled_columns(N, X, J, M, system, least):
-    """J[STABLE_COLS]: the columns, not identically zero, of rows of a kind below ``least``; returns their number."""
+    """The columns, not identically zero, of rows of a kind below ``least``; returns their number.
+
+    J[STABLE_COLS], J[SETTLED_ROW], X[SETTLED_SLOPE]: the columns, their rows and slopes.
+    """
+    if least < UNSTABLE:
+        return np.int64(0)  # only rows whose output is zero are left out
     rows, cols = N[system + SYS_ROWS], N[system + SYS_COLS]
     col_row = system + SYS_HEADER + N[system + SYS_LEVELS] + 1 + rows + rows + 1
-    count = 0
-    for c in range(cols):
-        r = N[col_row + c]
-        if J[KIND * M + r] < least and (X[SLOPE * M + c] != 0.0 or X[OFFSET * M + c] != 0.0):
-            J[STABLE_COLS * M + count] = c
-            count += 1
+    count = np.int64(0)
+    zero = splat_wide(0.0)
+    for c in range(0, cols, 8):
+        slope, offset = load_wide(X, SLOPE * M + c), load_wide(X, OFFSET * M + c)
+        kind = load_integers(J, COL_KIND * M + c)
+        is_zero = both(same(slope, zero), same(offset, zero))
+        inside = is_below(count_up(c), splat_integer(cols))
+        settled = without(both(inside, is_below(kind, splat_integer(least))), is_zero)
+        pack_store(J, STABLE_COLS * M + count, count_up(c), settled)
+        pack_store(J, SETTLED_ROW * M + count, load_integers(N, col_row + c), settled)
+        pack_store(X, SETTLED_SLOPE * M + count, slope, settled)
+        count += count_bits(bits_of(settled))
     return count
 
 
 @njit(cache=True, error_model="numpy")
-def read_settled_row(F, N, X, J, M, system, floats, p, new_cols, folded, at, stride):
-    """What settled column ``p`` reads of the kept columns and the input, times its slope: F[at : at + stride]."""
+def read_settled_rows(F, N, X, J, M, system, floats, first, last, new_cols, work, stride):
+    """What settled columns ``first : last``, of one level, read of the kept columns and the input, times their slope.
+
+    For each, F[work + p * stride] and on: the four affine coefficients, then the new columns, padded. Returns how many
+    of these numbers are not zero for want of anything to read.
+    """
     rows, cols = N[system + SYS_ROWS], N[system + SYS_COLS]
-    row_col = system + SYS_HEADER + N[system + SYS_LEVELS] + 1 + rows
-    col_row = row_col + rows + 1
-    col_begin = col_row + cols
-    new_rows = N[folded + SYS_ROWS]
-    new_row_col = folded + SYS_HEADER + N[folded + SYS_LEVELS] + 1 + new_rows
-    new_col_row = new_row_col + new_rows + 1
-    weights = floats + 4 * rows
-    affine = padded(new_cols)
-    c = J[STABLE_COLS * M + p]
-    r = N[col_row + c]
-    slope = X[SLOPE * M + c]
-    for k in range(0, stride, 4):
-        store(F, at + k, splat(0.0))
-    for k in range(new_cols):
-        q = N[new_col_row + k]
-        old = N[row_col + J[KEPT_ROWS * M + q]] + k - N[new_row_col + q]
-        if N[col_begin + old] > r:
-            break
-        F[at + k] = slope * F[weights + old * rows + r]
-    for axis in range(4):
-        F[at + affine + axis] = slope * F[floats + axis * rows + r]
-    F[at + affine + 3] += X[OFFSET * M + c]
+    col_begin = system + SYS_HEADER + N[system + SYS_LEVELS] + 1 + 2 * rows + 1 + cols
+    weights = weights_of(floats, rows)
+    level_begin = J[SETTLED_ROW * M + first]
+    zero = splat(0.0)
+    # Columns of this level and later ones are not read.
+    read = 0
+    while read < new_cols and N[col_begin + J[OLD_COL * M + read]] <= level_begin:
+        read += 1
+    for k in range(0, read, 4):
+        a, b = weights + J[OLD_COL * M + k] * rows, weights + J[OLD_COL * M + min(k + 1, read - 1)] * rows
+        c, d = (
+            weights + J[OLD_COL * M + min(k + 2, read - 1)] * rows,
+            weights + J[OLD_COL * M + min(k + 3, read - 1)] * rows,
+        )
+        for p in range(first, last):
+            r = J[SETTLED_ROW * M + p]
+            slope = splat(X[SETTLED_SLOPE * M + p])
+            store(F, work + p * stride + 4 + k, fma(slope, lanes_of(F[a + r], F[b + r], F[c + r], F[d + r]), zero))
+    for p in range(first, last):
+        r, slope, at = J[SETTLED_ROW * M + p], X[SETTLED_SLOPE * M + p], work + p * stride
+        for axis in range(4):
+            F[at + axis] = slope * F[floats + axis * rows + r]
+        F[at + 3] += X[OFFSET * M + J[STABLE_COLS * M + p]]
+        for k in range(4 + padded(read), stride, 4):
+            store(F, at + k, zero)
+        for k in range(4 + read, 4 + padded(read)):
+            F[at + k] = 0.0
+    return 4 + padded(read)
 
 
 @njit(cache=True, error_model="numpy")
-def express_settled_rows(F, N, X, J, M, system, floats, settled, new_cols, folded, work, stride, scratch):
+def express_settled_rows(F, N, X, J, M, system, floats, settled, new_cols, work, stride, scratch):
     """Every settled column's output over the kept columns and the input.
 
-    Row ``p`` of the table at ``F[work]``, ``stride`` apart: weights on the new columns, then (padded) the four affine
-    coefficients. Level by level: those of one level read only settled columns of earlier ones, all in one product.
+    Row ``p`` of the table at ``F[work]``, ``stride`` apart: the four affine coefficients, then the weights on the new
+    columns. Level by level: those of one level read only settled columns of earlier ones, all in one product.
     """
     rows, cols = N[system + SYS_ROWS], N[system + SYS_COLS]
-    col_row = system + SYS_HEADER + N[system + SYS_LEVELS] + 1 + 2 * rows + 1
-    col_begin = col_row + cols
-    weights = floats + 4 * rows
+    col_begin = system + SYS_HEADER + N[system + SYS_LEVELS] + 1 + 2 * rows + 1 + cols
+    weights = weights_of(floats, rows)
     zero = first = np.int64(0)
     while first < settled:
         level_end = N[col_begin + J[STABLE_COLS * M + first]]
         last = first
-        while last < settled and N[col_begin + J[STABLE_COLS * M + last]] == level_end:
-            read_settled_row(F, N, X, J, M, system, floats, last, new_cols, folded, work + last * stride, stride)
+        while last < settled and J[SETTLED_ROW * M + last] < level_end:
             last += 1
+        used = read_settled_rows(F, N, X, J, M, system, floats, first, last, new_cols, work, stride)
         width = last - first
         for e in range(first):
             source = weights + J[STABLE_COLS * M + e] * rows
             target = scratch + e * width - first
             for p in range(first, last):
-                c = J[STABLE_COLS * M + p]
-                F[target + p] = X[SLOPE * M + c] * F[source + N[col_row + c]]
+                F[target + p] = X[SETTLED_SLOPE * M + p] * F[source + J[SETTLED_ROW * M + p]]
         p = first
         while p + 4 <= last:
-            accumulate_four(F, work + p * stride, zero, stride, stride, work, zero, first, scratch + p - first, width)
+            accumulate_four(F, work + p * stride, zero, used, stride, work, zero, first, scratch + p - first, width)
             p += 4
         while p < last:
-            accumulate(F, work + p * stride, zero, stride, stride, work, zero, first, scratch + p - first, width)
+            accumulate(F, work + p * stride, zero, used, stride, work, zero, first, scratch + p - first, width)
             p += 1
         first = last
 
 
 @njit(cache=True, error_model="numpy")
 def gather_column(F, J, M, source, begin, rows, target):
-    """Copy a column's weights on the kept rows ``begin:rows``."""
-    kept = KEPT_ROWS * M
-    for q in range(begin, rows):
-        F[target + q] = F[source + J[kept + q]]
+    """Copy a column of ``rows`` weights to the new rows, from old row ``begin`` on.
+
+    What follows the column is overwritten, see OVERWRITTEN.
+    """
+    for chunk in range(begin >> 3, (rows + 7) >> 3):
+        weights = load_wide(F, source + 8 * chunk)
+        pack_store(F, target + J[PLACE * M + chunk], weights, mask_of(J[KEPT * M + chunk]))
 
 
 @njit(cache=True, error_model="numpy")
-def multiply_settled(F, N, J, M, folded, weights, gathered, settled, work, stride, col_row):
+def multiply_settled(F, N, J, M, folded, weights, gathered, settled, work, stride):
     """Add to every kept column what the rows read of it through the settled ones, four columns of a level at a time."""
     rows, cols = N[folded + SYS_ROWS], N[folded + SYS_COLS]
     new_col_row = folded + SYS_HEADER + N[folded + SYS_LEVELS] + 1 + 2 * rows + 1
@@ -197,7 +171,7 @@ def multiply_settled(F, N, J, M, folded, weights, gathered, settled, work, strid
     while k < cols:
         # Settled units of this column's level or before do not read it.
         row = J[KEPT_ROWS * M + N[new_col_row + k]]
-        while first < settled and N[col_row + J[STABLE_COLS * M + first]] <= row:
+        while first < settled and J[SETTLED_ROW * M + first] <= row:
             first += 1
         begin = N[col_begin + k]
         if k + 4 <= cols and N[col_begin + k + 3] == begin:
@@ -220,38 +194,32 @@ def fold(F, N, X, J, M, system, floats, folded, folded_floats, least):
     col_begin = row_col + rows + 1 + cols
     new_rows, new_cols = lay_out_folded(N, J, M, system, folded, least)
     settled = list_settled_columns(N, X, J, M, system, least)
-    new_row_col = folded + SYS_HEADER + N[folded + SYS_LEVELS] + 1 + new_rows
-    new_col_row = new_row_col + new_rows + 1
     stride = padded(new_cols) + 4
-    affine = padded(new_cols)
-    work = folded_floats + N[folded + SYS_FLOATS]
+    work = folded_floats + N[folded + SYS_FLOATS] + OVERWRITTEN
     gathered = work + settled * stride
-    express_settled_rows(F, N, X, J, M, system, floats, settled, new_cols, folded, work, stride, gathered)
-    weights = floats + 4 * rows
+    express_settled_rows(F, N, X, J, M, system, floats, settled, new_cols, work, stride, gathered)
+    weights = weights_of(floats, rows)
     zero = begin = np.int64(0)
     for p in range(settled):
         c = J[STABLE_COLS * M + p]
         # Later rows only: a settled column is read by no row of its own level or before.
         while begin < new_rows and J[KEPT_ROWS * M + begin] < N[col_begin + c]:
             begin += 1
-        gather_column(F, J, M, weights + c * rows, begin, new_rows, gathered + p * new_rows)
-        for q in range(begin):
-            F[gathered + p * new_rows + q] = 0.0
-    for axis in range(4):
-        target = folded_floats + axis * new_rows
-        gather_column(F, J, M, floats + axis * rows, zero, new_rows, target)
-    accumulate_four(F, folded_floats, zero, new_rows, new_rows, gathered, zero, settled, work + affine, stride)
-    new_weights = folded_floats + 4 * new_rows
+        gather_column(F, J, M, weights + c * rows, N[col_begin + c], rows, gathered + p * new_rows)
+        for q in range(0, begin, 4):
+            store(F, gathered + p * new_rows + q, splat(0.0))
+    for k in range(ROW_FLOATS):
+        gather_column(F, J, M, floats + k * rows, zero, rows, folded_floats + k * new_rows)
+    accumulate_four(F, folded_floats, zero, new_rows, new_rows, gathered, zero, settled, work, stride)
+    new_weights = weights_of(folded_floats, new_rows)
     new_out = new_weights + new_cols * new_rows
     out_weights = weights + cols * rows
-    new_col_begin = new_col_row + new_cols
-    col_row = row_col + rows + 1
     for k in range(new_cols):
-        q = N[new_col_row + k]
-        old = N[row_col + J[KEPT_ROWS * M + q]] + k - N[new_row_col + q]
-        gather_column(F, J, M, weights + old * rows, N[new_col_begin + k], new_rows, new_weights + k * new_rows)
-        F[new_out + k] = F[out_weights + old]
-    multiply_settled(F, N, J, M, folded, new_weights, gathered, settled, work, stride, col_row)
+        column = weights + J[OLD_COL * M + k] * rows
+        gather_column(F, J, M, column, N[col_begin + J[OLD_COL * M + k]], rows, new_weights + k * new_rows)
+    for k in range(new_cols):
+        F[new_out + k] = F[out_weights + J[OLD_COL * M + k]]
+    multiply_settled(F, N, J, M, folded, new_weights, gathered, settled, work + 4, stride)
     out, new_constant = out_weights + padded(cols), new_out + padded(new_cols)
     for axis in range(4):
         F[new_constant + axis] = F[out + axis]
@@ -259,31 +227,12 @@ def fold(F, N, X, J, M, system, floats, folded, folded_floats, least):
         w = F[out_weights + J[STABLE_COLS * M + p]]
         at = work + p * stride
         for k in range(new_cols):
-            F[new_out + k] += w * F[at + k]
+            F[new_out + k] += w * F[at + 4 + k]
         for axis in range(4):
-            F[new_constant + axis] += w * F[at + affine + axis]
-
-
-@njit(cache=True, error_model="numpy")
-def carry_states(N, J, M, tables, system, folded, least):
-    """After `fold`: move the state ranges in J to the rows of the folded system, hash the others' states into it."""
-    rows = N[system + SYS_ROWS]
-    row_unit = system + SYS_HEADER + N[system + SYS_LEVELS] + 1
-    hash0, hash1 = N[system + SYS_HASH], N[system + SYS_HASH + 1]
-    for r in range(rows):
-        unit = N[row_unit + r]
-        if unit >= 0 and J[KIND * M + r] < least:
-            state = tables.first_knot[unit] + unit + J[STATE_LOW * M + r]
-            hash0 ^= tables.state_hash[2 * state]
-            hash1 ^= tables.state_hash[2 * state + 1]
-    N[folded + SYS_HASH], N[folded + SYS_HASH + 1] = hash0, hash1
-    for q in range(N[folded + SYS_ROWS]):
-        r = J[KEPT_ROWS * M + q]
-        J[STATE_LOW * M + q] = J[STATE_LOW * M + r]
-        J[STATE_HIGH * M + q] = J[STATE_HIGH * M + r]
+            F[new_constant + axis] += w * F[at + axis]
 
 
 @njit(cache=True, error_model="numpy")
 def folding_floats(rows, cols):
     """Upper bound of what `fold` writes to F for a system of this size."""
-    return system_floats(rows, cols) + cols * (padded(cols) + 4) + cols * max(rows, cols)
+    return system_floats(rows, cols) + cols * (padded(cols) + 4) + cols * max(rows, cols) + 2 * OVERWRITTEN

@@ -72,13 +72,13 @@ def pointer(typing_context: Any, array: Any) -> Any:
 @intrinsic
 def load(typing_context: Any, source: Any, index: Any) -> Any:
     """``source[index : index + WIDTH]`` through a pointer."""
-    return lanes(source, types.int64), _load
+    return lanes(source, types.int64), load_plain
 
 
 @intrinsic
 def load_wide(typing_context: Any, source: Any, index: Any) -> Any:
     """``source[index : index + WIDE]`` through a pointer."""
-    return wide_lanes(source, types.int64), _load
+    return wide_lanes(source, types.int64), load_plain
 
 
 @intrinsic
@@ -86,12 +86,13 @@ def load_like(typing_context: Any, like: Any, source: Any, index: Any) -> Any:
     """As many values of ``source`` from ``index`` on as ``like`` has lanes: for kernels of either width."""
 
     def code(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        return _load(context, builder, signature, arguments[1:])
+        return load_plain(context, builder, signature, arguments[1:])
 
     return like(like, source, types.int64), code
 
 
-def _load(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+def load_plain(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+    """Code of a load whose type follows from the intrinsic's signature."""
     return builder.load(_vector_pointer(builder, signature.return_type.vector, *arguments), align=8)
 
 
@@ -130,9 +131,26 @@ def splat_like(typing_context: Any, like: Any, value: Any) -> Any:
 
 
 def _splat(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-    vector = signature.return_type.vector
-    first = builder.insert_element(ir.Constant(vector, ir.Undefined), arguments[0], ir.Constant(_INT32, 0))
+    return shuffle_first(builder, signature.return_type.vector, arguments[0])
+
+
+def shuffle_first(builder: Any, vector: Any, value: Any) -> Any:
+    """One value in all lanes of a vector type."""
+    first = builder.insert_element(ir.Constant(vector, ir.Undefined), value, ir.Constant(_INT32, 0))
     return _shuffle(builder, first, [0] * vector.count)
+
+
+@intrinsic
+def lanes_of(typing_context: Any, a: Any, b: Any, c: Any, d: Any) -> Any:
+    """Four numbers as the lanes of a register."""
+
+    def code(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        vector = ir.Constant(lanes.vector, ir.Undefined)
+        for k, value in enumerate(arguments):
+            vector = builder.insert_element(vector, value, ir.Constant(_INT32, k))
+        return vector
+
+    return lanes(types.float64, types.float64, types.float64, types.float64), code
 
 
 @intrinsic
@@ -189,6 +207,32 @@ def total(typing_context: Any, a: Any) -> Any:
         return builder.fadd(*ends)
 
     return types.float64(a), code
+
+
+@intrinsic
+def halves(typing_context: Any, a: Any) -> Any:
+    """The lower four of eight lanes plus the upper four."""
+
+    def code(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        low, high = (_shuffle(builder, arguments[0], [first + k for k in range(WIDTH)]) for first in (0, WIDTH))
+        return builder.fadd(low, high)
+
+    return lanes(wide_lanes), code
+
+
+@intrinsic
+def totals(typing_context: Any, a: Any, b: Any, c: Any, d: Any) -> Any:
+    """The sums of the lanes of four registers, in one."""
+
+    def code(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        def add(left: Any, right: Any, *orders: list[int]) -> Any:
+            masks = (ir.Constant(ir.VectorType(_INT32, WIDTH), order) for order in orders)
+            return builder.fadd(*(builder.shuffle_vector(left, right, mask) for mask in masks))
+
+        pairs = [add(*arguments[k : k + 2], [0, 4, 2, 6], [1, 5, 3, 7]) for k in (0, 2)]
+        return add(*pairs, [0, 1, 4, 5], [2, 3, 6, 7])
+
+    return lanes(lanes, lanes, lanes, lanes), code
 
 
 @intrinsic

@@ -32,9 +32,11 @@ from mn_onnx.extract.kernels.memory import (
     VALUES,
     first_trim_tag,
     padded,
+    weights_of,
 )
 from mn_onnx.extract.kernels.polytope import (
     clip_polygon,
+    count_corners_inside,
     evaluate_affine,
     find_cut_edges,
     link_cut_edges,
@@ -96,14 +98,14 @@ def substitute_row(F, N, X, J, M, system, floats, tables, r, target):
     rows = N[system + SYS_ROWS]
     for axis in range(4):
         X[target + axis] = F[floats + axis * rows + r]
-    substitute(F, N, X, J, M, system, tables, r, floats + 4 * rows + r, rows, target)
+    substitute(F, N, X, J, M, system, tables, r, weights_of(floats, rows) + r, rows, target)
 
 
 @njit(cache=True, error_model="numpy")
 def substitute_output(F, N, X, J, M, system, floats, tables, target):
     """Affine form of the output at ``X[target : target + 4]`` under the chosen states of all rows."""
     rows, cols = N[system + SYS_ROWS], N[system + SYS_COLS]
-    out_weights = floats + 4 * rows + cols * rows
+    out_weights = weights_of(floats, rows) + cols * rows
     for axis in range(4):
         X[target + axis] = F[out_weights + padded(cols) + axis]
     substitute(F, N, X, J, M, system, tables, rows, out_weights, np.int64(1), target)
@@ -144,12 +146,13 @@ def emit_choice(F, N, X, J, M, output, tables, slot_of_tag, cell, cell_rows, sys
                 continue
             plane = knot + state - side
             constant = X[at + 3] - tables.knots[plane]
-            count = clip_polygon(
-                X, J, M, count, polygon, tags, other, other_tags,
-                X[at], X[at + 1], X[at + 2], constant, side, 2 * plane + side, gradient,
-            )  # fmt: skip
-            if count == 0:
+            inside = count_corners_inside(X, M, count, polygon, X[at], X[at + 1], X[at + 2], constant, side, gradient)
+            if inside == 0:
                 return 0
+            if inside == count:
+                continue
+            tag = 2 * plane + side
+            count = clip_polygon(X, J, M, count, polygon, tags, other, other_tags, side, tag)
             polygon, tags, other, other_tags = other, other_tags, polygon, tags
     for j in range(count):
         if J[tags * M + j] >= first_trim_tag(tables.n_knots):

@@ -36,8 +36,9 @@ from mn_onnx.extract.kernels.control import (
     TRIMMED,
 )
 from mn_onnx.extract.kernels.error_symbols import tracking_floats
-from mn_onnx.extract.kernels.fold import carry_states, fold, folding_floats
+from mn_onnx.extract.kernels.fold import fold, folding_floats
 from mn_onnx.extract.kernels.lanes import cycles, pointer
+from mn_onnx.extract.kernels.layout import carry_states, new_row
 from mn_onnx.extract.kernels.leaf import emit_leaf
 from mn_onnx.extract.kernels.memory import (
     CELL_CAPACITY,
@@ -51,7 +52,6 @@ from mn_onnx.extract.kernels.memory import (
     CENTRE_AT,
     DEAD,
     LINEAR,
-    NEW_INDEX,
     OUT_VALUES,
     STATE_HIGH,
     STATE_LOW,
@@ -106,7 +106,6 @@ def point_at_tables(tables):
         pointer(tables.tag_hash),
         tables.n_knots,
         tables.extent,
-        pointer(tables.two_pieces),
     )
 
 
@@ -217,7 +216,7 @@ def visit(F, N, X, J, M, control, stack, output, tables, slot_of_tag, cell):
         cell = trim_cell(F, N, X, J, M, control, tables, slot_of_tag, cell, rows, low, high, slack)
     if cell != whole:
         control[TRIMMED] += 1
-        newly_linear, newly_dead = settle_again(F, N, X, J, M, tables, cell, system)
+        newly_linear, newly_dead = settle_again(F, N, X, J, M, tables, cell, system, floats)
         linear += newly_linear
         dead += newly_dead
         leaf = is_leaf(N, J, M, control, system)
@@ -235,7 +234,7 @@ def visit(F, N, X, J, M, control, stack, output, tables, slot_of_tag, cell):
         control[TOP_I] = folded + N[folded + SYS_INTS]
         control[FOLDS] += 1
         if row >= 0:
-            row = J[NEW_INDEX * M + row]
+            row = new_row(J, M, row)
     if leaf:
         control[LEAVES] += 1
         control[BROKEN_CUTS] += emit_leaf(F, N, X, J, M, output, tables, slot_of_tag, cell, rows, folded, folded_floats)

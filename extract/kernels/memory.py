@@ -8,8 +8,9 @@ of the lane width, ``cols`` outputs of these units, and the hash of the states o
 
     N: the SYS_* header, level_start[levels + 1], row_unit[rows] (-1 where padded),
        row_col[rows + 1], col_row[cols], col_begin[cols], col_end[cols] (the rows a column has weights on)
-    F: affine parts a0[rows], a1[rows], a2[rows], a3[rows] (constant), weights[cols][rows],
-       output weights[cols], output affine part[4]
+    F: affine parts a0[rows], a1[rows], a2[rows], a3[rows] (constant); of units with one knot and one output
+       knot[rows], left slope[rows], left intercept[rows], right slope[rows], right intercept[rows] (the knot is NaN for
+       other units, infinite where padded); weights[cols][rows], output weights[cols], output affine part[4]
 
 *Cell*: a simple convex polytope and its state ranges for the rows of its system.
 
@@ -27,7 +28,8 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-SYS_ROWS, SYS_COLS, SYS_LEVELS, SYS_FLOATS, SYS_INTS, SYS_UNITS, SYS_HASH, SYS_HEADER = 0, 1, 2, 3, 4, 5, 6, 8
+SYS_ROWS, SYS_COLS, SYS_LEVELS, SYS_FLOATS, SYS_INTS, SYS_UNITS, SYS_HASH = 0, 1, 2, 3, 4, 5, 6
+SYS_SINGLE, SYS_HEADER = 8, 9  # 1 if every unit of the network has one output
 
 CELL_SYSTEM_F, CELL_SYSTEM_I, CELL_VERTICES, CELL_CAPACITY, CELL_FLOATS = 0, 1, 2, 3, 4
 CELL_END_F, CELL_END_I, CELL_DEPTH, CELL_HEADER = 5, 6, 7, 8
@@ -35,9 +37,9 @@ CELL_END_F, CELL_END_I, CELL_DEPTH, CELL_HEADER = 5, 6, 7, 8
 # Scratch regions of X. CENTRE takes four (the affine coefficients of every row), POLY_A and POLY_B three, FORMS four.
 (CENTRE, RADIUS, LOW, HIGH, SLOPE, OFFSET, ERROR, OUT_COEF) = (0, 4, 5, 6, 7, 8, 9, 10)
 (POLY_VALUES, CUT_X, CUT_Y, CUT_Z, CENTRE_AT, FORMS) = (19, 20, 21, 22, 23, 24)
-OUTPUTS = 28  # eight
-CUT_SHARE, GROWTH, SYMBOL_ERROR = 36, 37, 38
-X_REGIONS = 39
+OUTPUTS = 28  # five
+CUT_SHARE, GROWTH, SYMBOL_ERROR, SETTLED_SLOPE = 33, 34, 35, 36
+X_REGIONS = 37
 # Kernels are called with these. numba compiles a kernel once more for every constant among its arguments, except for
 # numpy's: so their numbers are numpy's, as are the constants in the kernels' calls of each other.
 VALUES, OUT_VALUES, POLY_A, POLY_B = np.int64(11), np.int64(12), np.int64(13), np.int64(16)
@@ -48,7 +50,11 @@ TAGS_A, TAGS_B = np.int64(8), np.int64(9)  # kernels are called with them
 (CUT_TO, KEPT_ROWS, STABLE_COLS, CHOICE, CHOICE_FIRST, CHOICE_LAST) = (10, 11, 12, 13, 14, 15)
 (READ_COLS, READ_AT, KIND, BELOW, ABOVE, SIDE_COUNTS) = (16, 17, 18, 19, 20, 21)
 (SYMBOL_AT, LEVEL_OUTPUT, LEVEL_SYMBOL, READ_ROW) = (22, 23, 24, 25)
-J_REGIONS = 26
+(KEPT, PLACE, OLD_COL, SETTLED_ROW, COL_KIND) = (26, 27, 28, 29, 30)
+J_REGIONS = 31
+
+# What F has for every row of a system, apart from the weights.
+ROW_FLOATS = 9
 
 # Kinds of rows: settled with output zero, settled, neither.
 DEAD, LINEAR, UNSTABLE = 0, 1, 2
@@ -65,6 +71,18 @@ def padded(count: int) -> int:
 
 
 @njit(cache=True, error_model="numpy")
+def knots_of(floats: int, rows: int) -> int:
+    """Where in F the table of knots of a system of so many rows begins."""
+    return floats + 4 * rows
+
+
+@njit(cache=True, error_model="numpy")
+def weights_of(floats: int, rows: int) -> int:
+    """Where in F the weights of a system of so many rows begin."""
+    return floats + ROW_FLOATS * rows
+
+
+@njit(cache=True, error_model="numpy")
 def system_ints(rows: int, cols: int, levels: int) -> int:
     """Number of int64 a system takes."""
     return SYS_HEADER + levels + 1 + 2 * rows + 1 + 3 * cols
@@ -73,7 +91,7 @@ def system_ints(rows: int, cols: int, levels: int) -> int:
 @njit(cache=True, error_model="numpy")
 def system_floats(rows: int, cols: int) -> int:
     """Number of float64 a system takes, padded to the lane width."""
-    return 4 * rows + cols * rows + padded(cols) + 4
+    return ROW_FLOATS * rows + cols * rows + padded(cols) + 4
 
 
 @njit(cache=True, error_model="numpy")

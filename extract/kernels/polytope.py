@@ -8,9 +8,24 @@ two ends of an edge on planes (b, c) list these two in opposite order.
 
 from __future__ import annotations
 
+import numpy as np
 from numba import njit
 
-from mn_onnx.extract.kernels.lanes import fma, load, splat, store
+from mn_onnx.extract.kernels.lanes import fma, load, load_wide, splat, splat_wide, store
+from mn_onnx.extract.kernels.masks import (
+    at_least,
+    bits_of,
+    both,
+    choose,
+    count_before,
+    count_bits,
+    count_up,
+    is_below,
+    pack_store,
+    same,
+    splat_integer,
+    without,
+)
 from mn_onnx.extract.kernels.memory import (
     ABOVE,
     BELOW,
@@ -62,15 +77,17 @@ def find_cut_edges(F, N, X, J, M, cell, rows, values):
     x = N[cell + CELL_FLOATS]
     capacity = N[cell + CELL_CAPACITY]
     t = values * M
-    # Signs are as good as random, so they move counters instead of choosing branches.
-    below, above = 0, 0
-    for v in range(n):
-        negative = X[t + v] < 0.0
-        J[BELOW * M + below] = v
-        J[ABOVE * M + above] = v
-        J[NEW_INDEX * M + v] = below if negative else above
-        below += negative
-        above += not negative
+    below, above = np.int64(0), np.int64(0)
+    for v in range(0, n, 8):
+        inside = is_below(count_up(v), splat_integer(n))
+        negative = both(inside, is_below(load_wide(X, t + v), splat_wide(0.0)))
+        others = without(inside, negative)
+        pack_store(J, BELOW * M + below, count_up(v), negative)
+        pack_store(J, ABOVE * M + above, count_up(v), others)
+        places = count_before(bits_of(negative), below), count_before(bits_of(others), above)
+        store(J, NEW_INDEX * M + v, choose(negative, places[0], places[1]))
+        below += count_bits(bits_of(negative))
+        above += count_bits(bits_of(others))
     J[SIDE_COUNTS * M] = below
     J[SIDE_COUNTS * M + 1] = above
     count = 0
@@ -193,26 +210,36 @@ def read_cut_polygon(X, J, M, count, polygon, tags):
 
 
 @njit(cache=True, error_model="numpy")
-def clip_polygon(X, J, M, count, polygon, tags, result, result_tags, a0, a1, a2, a3, side, tag, gradient):
-    """Keep the part of a convex polygon where a . x + a3 is negative (side 0) or not (side 1).
+def count_corners_inside(X, M, count, polygon, a0, a1, a2, a3, side, gradient):
+    """How many corners of a polygon lie where a . x + a3, in X[POLY_VALUES], is negative (side 0) or not (side 1).
 
     A corner exactly on the plane goes to the side where f (``X[gradient : gradient + 3]``) falls: the piece on the
-    other side has no point with f < 0 there. The new edge gets ``tag``. Returns the number of corners of the result,
-    0 where nothing is left.
+    other side has no point with f < 0 there.
     """
     rises = a0 * X[gradient] + a1 * X[gradient + 1] + a2 * X[gradient + 2] > 0.0
+    on_plane = splat_wide(-TINY if rises else 0.0)
+    b0, b1, b2, b3, zero = splat_wide(a0), splat_wide(a1), splat_wide(a2), splat_wide(a3), splat_wide(0.0)
+    at = polygon * M
+    inside = 0
+    for j in range(0, count, 8):
+        z = load_wide(X, at + 2 * M + j)
+        value = fma(b0, load_wide(X, at + j), fma(b1, load_wide(X, at + M + j), fma(b2, z, b3)))
+        value = choose(same(value, zero), on_plane, value)
+        store(X, POLY_VALUES * M + j, value)
+        above = at_least(value, zero)
+        corner = is_below(count_up(j), splat_integer(count))
+        inside += count_bits(bits_of(both(corner, above) if side == 1 else without(corner, above)))
+    return inside
+
+
+@njit(cache=True, error_model="numpy")
+def clip_polygon(X, J, M, count, polygon, tags, result, result_tags, side, tag):
+    """Keep the part of a convex polygon on one side of the plane that `count_corners_inside` has looked at.
+
+    The new edge gets ``tag``. Returns the number of corners of the result.
+    """
     px, py, pz = polygon * M, (polygon + 1) * M, (polygon + 2) * M
     values = POLY_VALUES * M
-    inside = 0
-    for j in range(count):
-        value = a0 * X[px + j] + (a1 * X[py + j] + (a2 * X[pz + j] + a3))
-        if value == 0.0 and rises:
-            value = -TINY
-        X[values + j] = value
-        if (value >= 0.0) == (side == 1):
-            inside += 1
-    if inside == 0:
-        return 0
     out = 0
     rx, ry, rz = result * M, (result + 1) * M, (result + 2) * M
     for j in range(count):

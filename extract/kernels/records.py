@@ -18,9 +18,7 @@ class Tables(NamedTuple):
     Output ``k`` of unit ``u`` has its pieces at ``first_piece[u] + k * (knots of u + 1)``. The plane of a knot has the
     knot's index; box face ``f`` is plane ``n_knots + f``. ``state_hash`` (int64 [n_knots + units, 2]) has a word pair
     per unit and state, ``tag_hash`` (int64 [2 * n_knots + 12, 2]) what turns the hash of a cell's states into that of a
-    vertex on the tagged plane. ``extent`` bounds the coordinates' magnitude on the box (at least 1). ``two_pieces``
-    (float64 [units, 8]) has the knot, left slope and intercept, right slope and intercept, and 1, of every unit with
-    one knot and one output; zeros for other units.
+    vertex on the tagged plane. ``extent`` bounds the coordinates' magnitude on the box (at least 1).
     """
 
     first_knot: Integers
@@ -32,7 +30,6 @@ class Tables(NamedTuple):
     tag_hash: Integers
     n_knots: int
     extent: float
-    two_pieces: Floats
 
 
 class WorkerArrays(NamedTuple):

@@ -11,7 +11,6 @@ from mn_onnx.extract.kernels.memory import (
     DEAD,
     ERROR,
     HIGH,
-    KIND,
     LINEAR,
     LOW,
     OFFSET,
@@ -94,44 +93,3 @@ def settle_row(N, X, J, M, tables, cols, r, unit):
         X[ERROR * M + c] = error
         piece += pieces
     return kind if first == last else UNSTABLE
-
-
-@njit(cache=True, error_model="numpy")
-def settle_two_pieces(X, J, M, tables, r, c, unit):
-    """`settle_row` for a unit of one knot and one output, column ``c``, as almost all are: without branches.
-
-    Which way such a unit goes is as good as random, and a branch guessed wrong costs more than all of this.
-    """
-    line = 8 * unit
-    knot, left, left_at = tables.two_pieces[line], tables.two_pieces[line + 1], tables.two_pieces[line + 2]
-    right, right_at = tables.two_pieces[line + 3], tables.two_pieces[line + 4]
-    reach = bound_radius(X, M, tables.extent, r)
-    low, high = X[LOW * M + r] - reach, X[HIGH * M + r] + reach
-    first, last = J[STATE_LOW * M + r], J[STATE_HIGH * M + r]
-    above = (first == 1) | ((last == 1) & (low >= knot))
-    below = (not above) & ((last == 0) | (high < knot))
-    settled = above | below
-    at_low = left * low + left_at
-    chord = (right * high + right_at - at_low) / (high - low)
-    deviation = left * knot + left_at - (at_low + chord * (knot - low))
-    middle = at_low - chord * low + 0.5 * deviation
-    slope = right if above else (left if below else chord)
-    offset = right_at if above else (left_at if below else middle)
-    J[STATE_LOW * M + r] = 1 if above else 0
-    J[STATE_HIGH * M + r] = 0 if below else 1
-    X[SLOPE * M + c] = slope
-    X[OFFSET * M + c] = offset
-    X[ERROR * M + c] = 0.0 if settled else 0.5 * abs(deviation)
-    dead = (slope == 0.0) & (offset == 0.0)
-    return (DEAD if dead else LINEAR) if settled else UNSTABLE
-
-
-@njit(cache=True, error_model="numpy")
-def settle(N, X, J, M, tables, row_col, r, unit):
-    """Tighten the state range of row ``r``, relax its outputs, and set its KIND, which is returned."""
-    if tables.two_pieces[8 * unit + 5] == 1.0:
-        kind = settle_two_pieces(X, J, M, tables, r, N[row_col + r], unit)
-    else:
-        kind = settle_row(N, X, J, M, tables, row_col, r, unit)
-    J[KIND * M + r] = kind
-    return kind

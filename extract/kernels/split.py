@@ -6,6 +6,19 @@ import numpy as np
 from numba import njit
 
 from mn_onnx.extract.kernels.control import BROKEN_CUTS, STACK_TOP, TOP_F, TOP_I
+from mn_onnx.extract.kernels.lanes import load_wide, splat_wide
+from mn_onnx.extract.kernels.masks import (
+    at_least,
+    bits_of,
+    both,
+    count_up,
+    is_below,
+    load_integers,
+    lowest_bit,
+    same,
+    splat_integer,
+    without,
+)
 from mn_onnx.extract.kernels.memory import (
     CELL_CAPACITY,
     CELL_DEPTH,
@@ -17,6 +30,7 @@ from mn_onnx.extract.kernels.memory import (
     CELL_SYSTEM_I,
     CENTRE_AT,
     HIGH,
+    KIND,
     LOW,
     RADIUS,
     STATE_HIGH,
@@ -25,6 +39,7 @@ from mn_onnx.extract.kernels.memory import (
     SYS_LEVELS,
     SYS_ROWS,
     TRIMMED_DEPTHS,
+    UNSTABLE,
     VALUES,
     cell_ints,
     first_trim_tag,
@@ -39,14 +54,29 @@ THINNEST_SHARE, THINNEST = 0.03, 2.0**-30
 
 
 @njit(cache=True, error_model="numpy")
+def affine_unstable(N, X, J, M, row_unit, r, rows):
+    """Which of the eight rows from ``r`` on are unstable and affine on the cell, as bits."""
+    real = both(at_least(load_integers(N, row_unit + r), splat_integer(0)), is_below(count_up(r), splat_integer(rows)))
+    unstable = same(load_integers(J, KIND * M + r), splat_integer(UNSTABLE))
+    return bits_of(without(both(real, unstable), is_below(splat_wide(0.0), load_wide(X, RADIUS * M + r))))
+
+
+@njit(cache=True, error_model="numpy")
 def choose_split(N, X, J, M, tables, system):
     """Row and knot to split at: of the unstable rows that are affine on the cell, the one that cuts deepest."""
     row_unit = system + SYS_HEADER + N[system + SYS_LEVELS] + 1
     best, best_row, best_knot = -1.0, -1, 0
-    for r in range(N[system + SYS_ROWS]):
+    rows = N[system + SYS_ROWS]
+    chunk, left = np.int64(-8), np.int64(0)
+    while True:
+        while left == 0:
+            chunk += 8
+            if chunk >= rows:
+                return best_row, best_knot
+            left = affine_unstable(N, X, J, M, row_unit, chunk, rows)
+        r = chunk + lowest_bit(left)
+        left &= left - 1
         first, last = J[STATE_LOW * M + r], J[STATE_HIGH * M + r]
-        if N[row_unit + r] < 0 or first == last or X[RADIUS * M + r] > 0.0:
-            continue
         low, high = X[LOW * M + r], X[HIGH * M + r]
         knot = tables.first_knot[N[row_unit + r]]
         middle = 0.5 * (low + high)
@@ -64,7 +94,6 @@ def choose_split(N, X, J, M, tables, system):
         score = min(high - kappa, kappa - low) / norm
         if score > best:
             best, best_row, best_knot = score, r, a
-    return best_row, best_knot
 
 
 @njit(cache=True, error_model="numpy")
