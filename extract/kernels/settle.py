@@ -167,14 +167,16 @@ def settle_rows(F, N, X, J, M, tables, row_unit, row_col, floats, rows, begin, e
             continue
         for q in range(r, min(r + 8, end)):
             unit = N[row_unit + q]
-            if unit < 0 or (again and J[KIND * M + q] != UNSTABLE):
+            if unit < 0:
                 continue
+            # Also rows that were settled before: packing the rows before them has written over their columns.
+            counted = not again or J[KIND * M + q] == UNSTABLE
             row_kind = settle_row(N, X, J, M, tables, row_col, q, unit)
             J[KIND * M + q] = row_kind
             for c in range(N[row_col + q], N[row_col + q + 1]):
                 J[COL_KIND * M + c] = row_kind
-            linear += row_kind == LINEAR
-            dead += row_kind == DEAD
+            linear += counted & (row_kind == LINEAR)
+            dead += counted & (row_kind == DEAD)
             if not again:
                 count = list_outputs(N, X, J, M, row_col, rows, q, count)
     return linear, dead, count
