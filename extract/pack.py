@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from mn_onnx.extract.kernels.lanes import WIDTH
+from mn_onnx.extract.kernels.lanes import WIDE
 from mn_onnx.extract.kernels.memory import (
     CELL_CAPACITY,
     CELL_END_F,
@@ -26,6 +26,7 @@ from mn_onnx.extract.kernels.memory import (
     SYS_ROWS,
     SYS_SINGLE,
     SYS_UNITS,
+    padded,
     system_floats,
     system_ints,
 )
@@ -131,7 +132,7 @@ def _pack_system(network: Network, order: Integers) -> tuple[Floats, Integers]:
     for level in range(int(levels.max()) + 1 if levels.size else 0):
         members = order[levels == level]
         row_of_unit[members] = starts[-1] + np.arange(members.size)
-        starts.append(-(-(starts[-1] + members.size) // WIDTH) * WIDTH)
+        starts.append(-(-(starts[-1] + members.size) // WIDE) * WIDE)
     rows, n_levels = starts[-1], len(starts) - 1
     row_unit = np.full(rows, -1, np.int64)
     row_unit[row_of_unit[order]] = np.arange(order.size)
@@ -159,7 +160,7 @@ def _pack_system(network: Network, order: Integers) -> tuple[Floats, Integers]:
         if unit.table is not None:
             pieces[:, r] = _two_pieces(unit.table)
         weights[col_of_variable[unit.row.columns[~inside]], r] = unit.row.weights[~inside]
-    out_weights = np.zeros(-(-cols // WIDTH) * WIDTH)
+    out_weights = np.zeros(padded(cols))
     out_affine = np.zeros(4)
     inside = network.output.columns < network.input_dim
     out_affine[network.output.columns[inside]] = network.output.weights[inside]
@@ -186,7 +187,7 @@ def _last_rows(weights: Floats) -> Integers:
         return np.zeros(cols, np.int64)
     used = weights != 0.0
     last = np.where(used.any(axis=1), rows - used[:, ::-1].argmax(axis=1), 0)
-    return -(-last // WIDTH) * WIDTH
+    return -(-last // WIDE) * WIDE
 
 
 def _pack_box(
@@ -209,7 +210,7 @@ def _pack_box(
     padded_pieces = []
     for level in range(int(levels.max()) + 1 if levels.size else 0):
         members = pieces[levels == level]
-        padded_pieces.append(np.pad(members, (0, -members.size % WIDTH)))
+        padded_pieces.append(np.pad(members, (0, -members.size % WIDE)))
     high = np.concatenate([*padded_pieces, np.zeros(0, np.int64)])
     header = np.zeros(CELL_HEADER, np.int64)
     header[CELL_SYSTEM_F], header[CELL_SYSTEM_I] = 0, 0

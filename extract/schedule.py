@@ -41,7 +41,7 @@ Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
 LEAF_CHOICES = 8
-BUDGET = 20_000_000  # weights read between two looks at the world: some tens of milliseconds
+BUDGET = 4_000_000  # weights read between two looks at the world: some milliseconds
 BUFFER_CORNERS = 1 << 16
 
 
@@ -90,24 +90,32 @@ class _Task:
     following: _Task | None = None
 
 
+def _aligned_floats(size: int) -> Floats:
+    """float64 [size], uninitialised, from the beginning of a cache line on."""
+    line = 8
+    room = np.empty(size + line)
+    return room[-room.ctypes.data // room.itemsize % line :][:size]
+
+
 class _Worker:
     """Owns arenas, and runs one task at a time."""
 
     def __init__(self, packed: Packed) -> None:
         largest = max(packed.rows, symbol_stride(packed.cols, packed.levels)) + 8
         self.packed = packed
-        self.F = np.empty(max(1 << 16, 2 * packed.F.size))
+        self.F = _aligned_floats(max(1 << 16, 2 * packed.F.size))
         self.N = np.empty(max(1 << 16, 2 * packed.N.size), np.int64)
         self.control = np.zeros(entries.CONTROL_SIZE, np.int64)
         self.control[entries.LEAF_CHOICES] = LEAF_CHOICES
         self.stack = np.zeros(1024, np.int64)
         self.slot_of_tag = np.zeros(first_trim_tag(packed.tables.n_knots) + 2 * TRIMMED_DEPTHS, np.int64)
-        self._set_scratch(max(512, -(-largest // 4) * 4))
+        self._set_scratch(max(512, -(-largest // 8) * 8))
         self._set_output(BUFFER_CORNERS // 4, BUFFER_CORNERS)
         self.polygons = self.corners = 0
 
     def _set_scratch(self, region: int) -> None:
-        self.X = np.zeros(X_REGIONS * region)
+        self.X = _aligned_floats(X_REGIONS * region)
+        self.X[:] = 0.0
         self.J = np.zeros(J_REGIONS * region, np.int64)
 
     def _set_output(self, polygons: int, corners: int) -> None:
@@ -130,7 +138,7 @@ class _Worker:
 
     def _reserve(self, floats: int, integers: int) -> None:
         if floats > self.F.size:
-            grown = np.empty(floats + floats // 2)
+            grown = _aligned_floats(floats + floats // 2)
             grown[: self.F.size] = self.F
             self.F = grown
         if integers > self.N.size:
@@ -169,7 +177,7 @@ class _Worker:
             if status == kernel.ARENA_FULL:
                 self._reserve(int(self.control[entries.NEED_F]), int(self.control[entries.NEED_I]))
             elif status == kernel.SCRATCH_FULL:
-                self._set_scratch(-(-2 * int(self.control[entries.NEED_I]) // 4) * 4)
+                self._set_scratch(-(-2 * int(self.control[entries.NEED_I]) // 8) * 8)
             elif status == kernel.STACK_FULL:
                 self.stack = np.concatenate([self.stack, np.zeros_like(self.stack)])
             else:
@@ -267,7 +275,7 @@ def traverse(
         try:
             while (task := pool.take()) is not None:
                 worker.start(task)
-                while not worker.run(task, BUDGET if not pool.wants_more() else BUDGET // 50):
+                while not worker.run(task, BUDGET if not pool.wants_more() else BUDGET // 20):
                     if pool.wants_more() and (given := worker.give_away()) is not None:
                         pool.put(task, given)
         except BaseException as error:  # noqa: BLE001 - whatever it is, the caller gets it

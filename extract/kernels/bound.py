@@ -51,6 +51,7 @@ from mn_onnx.extract.kernels.memory import (
     SYS_LEVELS,
     SYS_ROWS,
     SYS_SINGLE,
+    aligned,
     padded,
     symbol_stride,
     weights_of,
@@ -176,7 +177,8 @@ def bound_units(F, N, X, J, M, tables, cell, system, floats, scratch, tracked):
     col_end = row_col + rows + 1 + 2 * cols
     weights = weights_of(floats, rows)
     stride = symbol_stride(cols, levels)
-    errors, carried = scratch, scratch + rows * stride
+    errors = aligned(scratch)
+    carried = errors + rows * stride
     read = carried + cols * stride
     J[LEVEL_OUTPUT * M] = J[LEVEL_SYMBOL * M] = 0
     first, count, linear, dead = np.int64(0), np.int64(0), 0, 0

@@ -60,25 +60,30 @@ def track_errors(F, X, J, M, weights, begin, end, level, first, count, errors, c
 
     ``weights``: F's index of the columns. ``first:count``: the outputs that the rows read. The rows' table of errors
     starts at F[errors], the outputs' at F[carried], ``stride`` numbers for each row or output; F[read] is scratch of
-    four numbers an output.
+    a number for each row and output.
     """
     symbols = J[LEVEL_SYMBOL * M + level]
     # Errors of levels whose outputs no row reads any more come through other outputs only.
     own = 0
     while own < level and J[LEVEL_OUTPUT * M + own + 1] <= first:
         own += 1
+    outputs = count - first
     for r in range(begin, end, 4):
-        target = errors + r * stride
+        block = read + (r - begin) * outputs
         for p in range(first, count):
-            store(F, read + 4 * p, load(F, weights + J[READ_AT * M + p] + r))
-        start_errors(F, X, J, M, weights + r, target, stride, J[LEVEL_SYMBOL * M + own], symbols)
-        for earlier in range(level - 1):
-            start, stop = J[LEVEL_SYMBOL * M + earlier], J[LEVEL_SYMBOL * M + earlier + 1]
-            if start < stop:
-                since = max(first, J[LEVEL_OUTPUT * M + earlier + 1])
-                accumulate_four(F, target, start, stop, stride, carried, since, count, read, np.int64(4))
-        for k in range(4):
-            sum_errors(F, X, M, target + k * stride, r + k, symbols)
+            store(F, block + 4 * (p - first), load(F, weights + J[READ_AT * M + p] + r))
+        start_errors(F, X, J, M, weights + r, errors + r * stride, stride, J[LEVEL_SYMBOL * M + own], symbols)
+    four, blocks = np.int64(4), (end - begin) >> 2
+    for earlier in range(level - 1):
+        start, stop = J[LEVEL_SYMBOL * M + earlier], J[LEVEL_SYMBOL * M + earlier + 1]
+        if start < stop:
+            since = max(first, J[LEVEL_OUTPUT * M + earlier + 1])
+            accumulate_four(
+                F, errors + begin * stride, start, stop, stride, carried, since, count,
+                read - 4 * first, four, blocks, 4 * stride, 4 * outputs,
+            )  # fmt: skip
+    for r in range(begin, end):
+        sum_errors(F, X, M, errors + r * stride, r, symbols)
 
 
 @njit(cache=True, error_model="numpy")
@@ -95,7 +100,7 @@ def pass_errors_on(F, X, J, M, level, begin, end, errors, carried, stride):
         X[SYMBOL_ERROR * M + symbols] = X[ERROR * M + c]
         J[SYMBOL_AT * M + symbols] = J[READ_AT * M + p]
         symbols += X[ERROR * M + c] > 0.0
-    while symbols & 3:
+    while symbols & 7:
         X[SYMBOL_ERROR * M + symbols] = 0.0
         J[SYMBOL_AT * M + symbols] = J[SYMBOL_AT * M + symbols - 1]
         symbols += 1
@@ -106,4 +111,4 @@ def pass_errors_on(F, X, J, M, level, begin, end, errors, carried, stride):
 @njit(cache=True, error_model="numpy")
 def tracking_floats(rows, cols, levels):
     """Number of float64 that the tables of errors of a system take in scratch."""
-    return (rows + cols) * symbol_stride(cols, levels) + 4 * cols
+    return (rows + cols) * symbol_stride(cols, levels) + rows * cols + 8

@@ -44,6 +44,7 @@ from mn_onnx.extract.kernels.memory import (
     SYS_LEVELS,
     SYS_ROWS,
     UNSTABLE,
+    aligned,
     padded,
     system_floats,
     weights_of,
@@ -52,6 +53,7 @@ from mn_onnx.extract.kernels.products import accumulate, accumulate_four
 
 # `gather_column` writes up to so many numbers after the last one.
 OVERWRITTEN = 8
+ONE, FOUR = np.int64(1), np.int64(4)  # of numpy's, see `memory`
 
 
 @njit(cache=True, error_model="numpy")
@@ -140,10 +142,11 @@ def express_settled_rows(F, N, X, J, M, system, floats, settled, new_cols, work,
             target = scratch + e * width - first
             for p in range(first, last):
                 F[target + p] = X[SETTLED_SLOPE * M + p] * F[source + J[SETTLED_ROW * M + p]]
-        p = first
-        while p + 4 <= last:
-            accumulate_four(F, work + p * stride, zero, used, stride, work, zero, first, scratch + p - first, width)
-            p += 4
+        fours = width >> 2
+        accumulate_four(
+            F, work + first * stride, zero, used, stride, work, zero, first, scratch, width, fours, 4 * stride, FOUR
+        )
+        p = first + 4 * fours
         while p < last:
             accumulate(F, work + p * stride, zero, used, stride, work, zero, first, scratch + p - first, width)
             p += 1
@@ -167,19 +170,24 @@ def multiply_settled(F, N, J, M, folded, weights, gathered, settled, work, strid
     rows, cols = N[folded + SYS_ROWS], N[folded + SYS_COLS]
     new_col_row = folded + SYS_HEADER + N[folded + SYS_LEVELS] + 1 + 2 * rows + 1
     col_begin = new_col_row + cols
-    first, k = np.int64(0), 0
+    first = k = np.int64(0)
     while k < cols:
         # Settled units of this column's level or before do not read it.
         row = J[KEPT_ROWS * M + N[new_col_row + k]]
         while first < settled and J[SETTLED_ROW * M + first] <= row:
             first += 1
         begin = N[col_begin + k]
-        if k + 4 <= cols and N[col_begin + k + 3] == begin:
-            accumulate_four(F, weights + k * rows, begin, rows, rows, gathered, first, settled, work + k, stride)
-            k += 4
-        else:
-            accumulate(F, weights + k * rows, begin, rows, rows, gathered, first, settled, work + k, stride)
-            k += 1
+        last = k
+        while last < cols and N[col_begin + last] == begin:
+            last += 1
+        fours = (last - k) >> 2
+        accumulate_four(
+            F, weights + k * rows, begin, rows, rows, gathered, first, settled, work + k, stride, fours, 4 * rows, FOUR
+        )
+        for column in range(k + 4 * fours, last):
+            at = weights + column * rows
+            accumulate(F, at, begin, rows, rows, gathered, first, settled, work + column, stride)
+        k = last
 
 
 @njit(cache=True, error_model="numpy")
@@ -194,8 +202,8 @@ def fold(F, N, X, J, M, system, floats, folded, folded_floats, least):
     col_begin = row_col + rows + 1 + cols
     new_rows, new_cols = lay_out_folded(N, J, M, system, folded, least)
     settled = list_settled_columns(N, X, J, M, system, least)
-    stride = padded(new_cols) + 4
-    work = folded_floats + N[folded + SYS_FLOATS] + OVERWRITTEN
+    stride = aligned(new_cols + 4)
+    work = aligned(folded_floats + N[folded + SYS_FLOATS] + OVERWRITTEN)
     gathered = work + settled * stride
     express_settled_rows(F, N, X, J, M, system, floats, settled, new_cols, work, stride, gathered)
     weights = weights_of(floats, rows)
@@ -210,7 +218,7 @@ def fold(F, N, X, J, M, system, floats, folded, folded_floats, least):
             store(F, gathered + p * new_rows + q, splat(0.0))
     for k in range(ROW_FLOATS):
         gather_column(F, J, M, floats + k * rows, zero, rows, folded_floats + k * new_rows)
-    accumulate_four(F, folded_floats, zero, new_rows, new_rows, gathered, zero, settled, work, stride)
+    accumulate_four(F, folded_floats, zero, new_rows, new_rows, gathered, zero, settled, work, stride, ONE, zero, zero)
     new_weights = weights_of(folded_floats, new_rows)
     new_out = new_weights + new_cols * new_rows
     out_weights = weights + cols * rows
@@ -235,4 +243,4 @@ def fold(F, N, X, J, M, system, floats, folded, folded_floats, least):
 @njit(cache=True, error_model="numpy")
 def folding_floats(rows, cols):
     """Upper bound of what `fold` writes to F for a system of this size."""
-    return system_floats(rows, cols) + cols * (padded(cols) + 4) + cols * max(rows, cols) + 2 * OVERWRITTEN
+    return system_floats(rows, cols) + cols * aligned(cols + 4) + cols * max(rows, cols) + 4 * OVERWRITTEN

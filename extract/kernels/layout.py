@@ -48,6 +48,8 @@ from mn_onnx.extract.kernels.memory import (
     system_ints,
 )
 
+ALIGNED_UNITS = 64
+
 
 @njit(cache=True, error_model="numpy")
 def choose_rows(N, J, M, system, folded, least):
@@ -64,6 +66,8 @@ def choose_rows(N, J, M, system, folded, least):
     new_level_start = folded + SYS_HEADER
     new_rows, new_levels, new_units = np.int64(0), np.int64(0), 0
     N[new_level_start] = 0
+    # Levels of large systems begin where cache lines do; in small systems padding would cost more.
+    uneven = 7 if N[system + SYS_UNITS] >= ALIGNED_UNITS else 3
     for chunk in range((rows + 7) >> 3):
         J[KEPT * M + chunk] = 0
     for level in range(levels):
@@ -80,7 +84,7 @@ def choose_rows(N, J, M, system, folded, least):
             continue
         new_units += count
         chunk = begin >> 3
-        while count & 3:
+        while count & uneven:
             # Padding is a row that is left out: finite, and read by nothing.
             free = level_bits(8 * chunk, begin, end) & ~J[KEPT * M + chunk]
             if free == 0:

@@ -64,6 +64,7 @@ from mn_onnx.extract.kernels.memory import (
     SYS_UNITS,
     UNSTABLE,
     X_REGIONS,
+    aligned,
     cell_ints,
     padded,
     system_ints,
@@ -227,7 +228,7 @@ def visit(F, N, X, J, M, control, stack, output, tables, slot_of_tag, cell):
     folded, folded_floats = system, floats
     least = UNSTABLE if leaf else how_to_fold(N, system, linear, dead)
     if least > DEAD:
-        folded, folded_floats = control[TOP_I], control[TOP_F]
+        folded, folded_floats = control[TOP_I], aligned(control[TOP_F])
         fold(F, N, X, J, M, system, floats, folded, folded_floats, least)
         carry_states(N, J, M, tables, system, folded, least)
         control[TOP_F] = folded_floats + N[folded + SYS_FLOATS]

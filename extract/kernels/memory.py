@@ -71,6 +71,12 @@ def padded(count: int) -> int:
 
 
 @njit(cache=True, error_model="numpy")
+def aligned(place: int) -> int:
+    """``place`` rounded up to where a line of the machine's caches begins: wide loads across two lines take twice."""
+    return (place + 7) & ~7
+
+
+@njit(cache=True, error_model="numpy")
 def knots_of(floats: int, rows: int) -> int:
     """Where in F the table of knots of a system of so many rows begins."""
     return floats + 4 * rows
@@ -102,8 +108,11 @@ def cell_ints(rows: int, vertices: int) -> int:
 
 @njit(cache=True, error_model="numpy")
 def symbol_stride(cols: int, levels: int) -> int:
-    """Room for the error symbols of a system: one a column, padded level by level to the lane width."""
-    return padded(cols) + 4 * levels
+    """Room for the error symbols of a system: one a column, padded level by level to cache lines.
+
+    An odd number of lines: with many a power of two, rows of the same column would compete for one place in the cache.
+    """
+    return aligned(cols + 8 * levels) | 8
 
 
 @njit(cache=True, error_model="numpy")
