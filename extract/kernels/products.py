@@ -58,8 +58,8 @@ def accumulate_four(
 ):
     """`accumulate` for ``blocks`` times four targets, ``rows`` apart, whose coefficients are neighbours.
 
-    The targets of the next four begin ``target_step`` on, their coefficients ``coefficient_step``. Register tiles of 4 x
-    16: all blocks go through one narrow panel of F[gathered], which stays in the core's nearest cache, then the next.
+    The targets of the next four begin ``target_step`` on, their coefficients ``coefficient_step``. Register tiles of
+    4 x 16: all blocks go through one narrow panel of F[gathered], which stays in the nearest cache, then the next.
     """
     q = begin
     while q + 16 <= end:
