@@ -64,6 +64,13 @@ def assert_exact(network: Network) -> tuple[Extraction, LevelSet]:
     extraction = extract_surface(network, LOWER, UPPER, threads=1)
     assert_well_formed(network, extraction)
     surface = extraction.surface
+    if extraction.degeneracy.only_box_copies:
+        # Inside the box there is nothing, as the oracle says; what is shown lies in the faces of the box.
+        assert exact.area == 0
+        corners = surface.vertices[surface.corners]
+        in_face = np.logical_and.reduceat(np.abs(np.abs(corners) - 1.0) < 1e-9, surface.offsets[:-1])
+        assert in_face.any(axis=1).all()
+        return extraction, exact
     assert surface.area == pytest.approx(exact.area, abs=1e-9)
     assert point_set_counts(surface) == exact_counts(exact)
     if surface.volume is not None and surface.n_polygons:
@@ -73,7 +80,7 @@ def assert_exact(network: Network) -> tuple[Extraction, LevelSet]:
     return extraction, exact
 
 
-@pytest.mark.parametrize("seed", range(60))
+@pytest.mark.parametrize("seed", [*range(60), 66, 127])
 def test_integer_networks_are_exact(seed: int) -> None:
     assert_exact(as_network(IntegerNetwork(seed)))
 
