@@ -37,6 +37,22 @@ def test_an_error_stops_what_has_not_begun_and_is_raised(threads: int) -> None:
     assert len(begun) <= 2 * threads  # of four ranges for each thread
 
 
+def test_work_may_hand_out_work_of_its_own() -> None:
+    done = np.zeros((6, 6), np.int64)
+
+    def row(first: int, last: int) -> None:
+        for index in range(first, last):
+
+            def cell(begin: int, end: int, index: int = index) -> None:
+                time.sleep(0.001)
+                done[index, begin:end] += 1
+
+            run_blocks(cell, 6, 2)
+
+    run_blocks(row, 6, 2)
+    assert (done == 1).all()
+
+
 @pytest.mark.parametrize("n_items", [0, 1, 1000, 3 * BLOCK_SIZE + 17])
 def test_grouping_is_a_stable_sort(n_items: int) -> None:
     groups = np.random.default_rng(n_items).integers(0, 37, n_items).astype(np.uint16)

@@ -4,7 +4,8 @@ A worker owns two arenas, ``F`` (float64) and ``N`` (int64), which grow upwards 
 ``X`` (float64) and ``J`` (int64), cut into regions of ``M`` entries. Three kinds of blocks lie in the arenas.
 
 *System*: the network restricted to a cell and all cells inside it. ``rows`` units, padded level by level to a multiple
-of the lane width, ``cols`` outputs of these units, and the hash of the states of all units folded away.
+of four, in large systems of eight, ``cols`` outputs of these units, and the hash of the states of all units folded
+away.
 
     N: the SYS_* header, level_start[levels + 1], row_unit[rows] (-1 where padded),
        row_col[rows + 1], col_row[cols], col_begin[cols], col_end[cols] (the rows a column has weights on)
