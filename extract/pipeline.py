@@ -202,8 +202,8 @@ def _narrow(surface: Surface, length: float) -> int:
 
 def _doubtful(surface: Surface, length: float) -> tuple[str, ...]:
     """What may be due to rounding in a surface that is closed, a sentence each."""
-    # Not along the short axis, over which numpy's reductions are slow.
-    slopes = functools.reduce(np.maximum, np.abs(surface.gradients.T))
+    # Column by column: numpy's reductions along a short axis are slow.
+    slopes = functools.reduce(np.maximum, [np.abs(column) for column in surface.gradients.T])
     shallow = int(np.count_nonzero(slopes <= SHALLOW * slopes.max(initial=0.0)))
     counts = (
         (_narrow(surface, length), "polygons that may have no width but for rounding"),

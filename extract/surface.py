@@ -117,7 +117,7 @@ class Surface:
         """float64 [p, 3], the unit vector along each gradient; zero where the gradient is zero."""
         return _unit(self.gradients)
 
-    @property
+    @cached_property
     def unmatched(self) -> NDArray[np.int64]:
         """The corners whose edge lies inside the box but has no neighbour; empty for a surface that closes."""
         return np.flatnonzero((self.twins < 0) & (self.box_faces < 0))
