@@ -42,7 +42,7 @@ Integers = NDArray[np.int64]
 
 LEAF_CHOICES = 8
 BUDGET = 4_000_000  # weights read between two looks at the world: some milliseconds
-BUFFER_CORNERS = 1 << 16
+BUFFER_CORNERS = 1 << 18
 
 
 @dataclass
