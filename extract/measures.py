@@ -14,6 +14,12 @@ from mn_onnx.extract.blocks import BLOCK_SIZE, Indices, block_count, run_blocks
 Floats = NDArray[np.float64]
 
 
+def lengths(vectors: Floats) -> Floats:
+    """Lengths [n] of vectors [n, 3]; column by column, which is faster than sums along the short axis."""
+    x, y, z = vectors.T
+    return np.asarray(np.sqrt(x * x + y * y + z * z))
+
+
 @dataclass(frozen=True, eq=False)
 class PolygonMeasures:
     """What is measured on each of ``p`` polygons.
@@ -32,7 +38,7 @@ class PolygonMeasures:
 
     @cached_property
     def areas(self) -> Floats:
-        return np.asarray(np.sqrt(np.einsum("ij,ij->i", self.area_vectors, self.area_vectors)))
+        return lengths(self.area_vectors)
 
 
 @numba.njit(cache=True, nogil=True)

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from mn_onnx.extract.blocks import Indices, index_dtype, resolve_threads
 from mn_onnx.extract.components import Component, find_components, unpaired_edges
 from mn_onnx.extract.edges import pair_half_edges
-from mn_onnx.extract.measures import PolygonMeasures, measure_polygons
+from mn_onnx.extract.measures import PolygonMeasures, lengths, measure_polygons
 from mn_onnx.extract.tessellate import fan_triangles
 from mn_onnx.extract.umbrellas import Umbrellas, find_umbrellas
 
@@ -84,7 +84,7 @@ class Surface:
             corners=indices,
             twins=twins,
             box_faces=np.full(indices.size, -1, np.int8),
-            gradients=_unit(measures.area_vectors),
+            gradients=unit_vectors(measures.area_vectors),
             errors=np.zeros(bounds.size - 1),
         )
 
@@ -115,7 +115,7 @@ class Surface:
     @property
     def normals(self) -> Floats:
         """float64 [p, 3], the unit vector along each gradient; zero where the gradient is zero."""
-        return _unit(self.gradients)
+        return unit_vectors(self.gradients)
 
     @cached_property
     def unmatched(self) -> NDArray[np.int64]:
@@ -183,6 +183,7 @@ class Surface:
         return replace(self, report={**self.report, **entries})
 
 
-def _unit(vectors: Floats) -> Floats:
-    lengths = np.sqrt(np.einsum("ij,ij->i", vectors, vectors))
-    return np.asarray(vectors / np.where(lengths > 0, lengths, 1.0)[:, None])
+def unit_vectors(vectors: Floats) -> Floats:
+    """Vectors [n, 3] of length 1 in the directions of ``vectors`` [n, 3]; zero where these are."""
+    sizes = lengths(vectors)
+    return np.asarray(vectors / np.where(sizes > 0, sizes, 1.0)[:, None])

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from mn_onnx.extract.surface import Surface
+from mn_onnx.extract.surface import Surface, unit_vectors
 from mn_onnx.ir.evaluator import Evaluator
 from mn_onnx.ir.network import Network
 
@@ -56,7 +56,7 @@ def find_flat_regions(network: Network, lower: Floats, upper: Floats, surface: S
     if not surface.n_polygons:
         return FlatRegions(share)
     polygons = np.linspace(0, surface.n_polygons - 1, min(N_BESIDE, surface.n_polygons)).astype(np.int64)
-    beside = surface.centres(polygons) + STEP * size * surface.normals[polygons]
+    beside = surface.centres(polygons) + STEP * size * unit_vectors(surface.gradients[polygons])
     return FlatRegions(share, _flat_share(evaluator, beside, evaluator.values(beside), largest, size))
 
 
