@@ -17,7 +17,7 @@ from mn_onnx.extract.kernels.memory import (
     CELL_SYSTEM_F,
     CELL_SYSTEM_I,
     CELL_VERTICES,
-    ROW_FLOATS,
+    PIECE_FLOATS,
     SYS_COLS,
     SYS_FLOATS,
     SYS_HEADER,
@@ -119,7 +119,7 @@ def _pack_tables(network: Network, order: Integers, extent: float) -> Tables:
 def _two_pieces(table: KnotTable) -> Floats:
     """Knot, left slope and intercept, right slope and intercept of a unit with one knot and one output; else NaN."""
     if table.slopes.shape != (1, 2):
-        return np.full(ROW_FLOATS - DIMENSIONS - 1, np.nan)
+        return np.full(PIECE_FLOATS, np.nan)
     (left, right), (left_at, right_at) = table.slopes[0], table.intercepts[0]
     return np.array([table.knots[0], left, left_at, right, right_at])
 
@@ -149,7 +149,7 @@ def _pack_system(network: Network, order: Integers) -> tuple[Floats, Integers]:
         col_of_variable[first : first + unit.n_outputs] = row_col[row_of_unit[g]] + np.arange(unit.n_outputs)
 
     affine = np.zeros((4, rows))
-    pieces = np.zeros((ROW_FLOATS - 4, rows))
+    pieces = np.zeros((PIECE_FLOATS, rows))
     pieces[0] = np.inf
     weights = np.zeros((cols, rows))
     for g, unit in enumerate(network.units):

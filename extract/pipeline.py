@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import TypedDict, Unpack
@@ -16,6 +15,7 @@ from mn_onnx.extract.degeneracy.contract import contract_short_edges
 from mn_onnx.extract.degeneracy.flat import FlatRegions, find_flat_regions
 from mn_onnx.extract.degeneracy.limit import SCALES, limit_surface
 from mn_onnx.extract.degeneracy.perturb import perturbation
+from mn_onnx.extract.measures import lengths
 from mn_onnx.extract.schedule import Progress, TraversalStatistics, traverse
 from mn_onnx.extract.soup import PolygonSoup
 from mn_onnx.extract.surface import Surface
@@ -202,8 +202,7 @@ def _narrow(surface: Surface, length: float) -> int:
 
 def _doubtful(surface: Surface, length: float) -> tuple[str, ...]:
     """What may be due to rounding in a surface that is closed, a sentence each."""
-    # Column by column: numpy's reductions along a short axis are slow.
-    slopes = functools.reduce(np.maximum, [np.abs(column) for column in surface.gradients.T])
+    slopes = lengths(surface.gradients)
     shallow = int(np.count_nonzero(slopes <= SHALLOW * slopes.max(initial=0.0)))
     counts = (
         (_narrow(surface, length), "polygons that may have no width but for rounding"),

@@ -262,7 +262,7 @@ def bound_output(F, N, X, M, system, floats):
     radius, constant = 0.0, 0.0
     c = cols
     while c > 0:
-        # Four columns of one level at a time, later ones twice where there are fewer.
+        # Four columns of one level at a time; where there are fewer, the last one again.
         begin = N[col_begin + c - 1]
         width = 1
         while width < 4 and c > width and N[col_begin + c - 1 - width] == begin:

@@ -48,6 +48,7 @@ from mn_onnx.extract.kernels.memory import (
     system_ints,
 )
 
+# Systems of so many units are large.
 ALIGNED_UNITS = 64
 
 
@@ -57,8 +58,7 @@ def choose_rows(N, J, M, system, folded, least):
 
     For every eight old rows J[KEPT] has the bits of those that stay and J[PLACE] the new row of the first of them;
     J[KEPT_ROWS] has the old row of every new one, and if every unit has one output, J[OLD_COL] the old column of every
-    new one. Writes the folded system's levels and units; returns its number of
-    rows.
+    new one. Writes the folded system's levels and units; returns its number of rows.
     """
     rows, levels = N[system + SYS_ROWS], N[system + SYS_LEVELS]
     level_start = system + SYS_HEADER

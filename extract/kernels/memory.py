@@ -54,8 +54,9 @@ TAGS_A, TAGS_B = np.int64(8), np.int64(9)  # kernels are called with them
 (KEPT, PLACE, OLD_COL, SETTLED_ROW, COL_KIND) = (26, 27, 28, 29, 30)
 J_REGIONS = 31
 
-# What F has for every row of a system, apart from the weights.
-ROW_FLOATS = 9
+# What F has for every row of a system, apart from the weights: the affine part, and the two pieces around its knot.
+PIECE_FLOATS = 5
+ROW_FLOATS = 4 + PIECE_FLOATS
 
 # Kinds of rows: settled with output zero, settled, neither.
 DEAD, LINEAR, UNSTABLE = 0, 1, 2

@@ -95,7 +95,7 @@ def settle_eight(F, X, J, M, extent, table, rows, r, inside):
 
 @njit(cache=True, error_model="numpy")
 def list_eight(X, J, M, cols, rows, r, slope, offset, error, listed, count):
-    """`list_outputs` for the rows of ``r : r + 8`` in the mask ``listed``; J-like ``cols`` are their columns."""
+    """`list_outputs` for the rows of ``r : r + 8`` in the mask ``listed``, whose columns are ``cols``."""
     pack_store(J, READ_COLS * M + count, cols, listed)
     pack_store(J, READ_ROW * M + count, count_up(r), listed)
     pack_store(J, READ_AT * M + count, multiply(cols, splat_integer(rows)), listed)
