@@ -47,7 +47,7 @@ BUFFER_CORNERS = 1 << 18
 
 @dataclass
 class TraversalStatistics:
-    """What the traversal did."""
+    """What the traversal did; `mn_onnx.profile` describes ``profile`` and ``layers``."""
 
     nodes: int = 0
     pruned: int = 0
@@ -59,6 +59,7 @@ class TraversalStatistics:
     subtrees: int = 0
     threads: int = 1
     profile: Integers | None = None
+    layers: Integers | None = None
 
 
 @dataclass(frozen=True)
@@ -310,6 +311,7 @@ def _statistics(workers: list[_Worker], pool: _Pool) -> TraversalStatistics:
     def total(entry: int) -> int:
         return sum(int(worker.control[entry]) for worker in workers)
 
+    profile = np.sum([worker.control[entries.PROFILE :] for worker in workers], axis=0).reshape(4, -1)
     return TraversalStatistics(
         nodes=total(entries.NODES),
         pruned=total(entries.PRUNED),
@@ -320,7 +322,8 @@ def _statistics(workers: list[_Worker], pool: _Pool) -> TraversalStatistics:
         deepest=max(int(worker.control[entries.DEEPEST]) for worker in workers),
         subtrees=pool.subtrees,
         threads=len(workers),
-        profile=np.sum([worker.control[entries.PROFILE :] for worker in workers], axis=0).reshape(2, -1),
+        profile=profile[:2],
+        layers=profile[2:],
     )
 
 

@@ -23,8 +23,8 @@ Its keys:
   or nothing to measure;
 - ``parity_max_abs_err``, ``parity_allowed_err``, ``parity_points``, ``parity_runtime``, ``parity_note``: the comparison
   of the imported network with onnxruntime, null without checks;
-- ``nodes``; and the counts of `mn_onnx.extract.schedule.TraversalStatistics` under ``traversal``, with the ``profile``
-  that `mn_onnx.profile` describes;
+- ``nodes``; and the counts of `mn_onnx.extract.schedule.TraversalStatistics` under ``traversal``, with ``profile``
+  and ``layers``, which `mn_onnx.profile` describes;
 - ``degeneracy``, ``flat_regions``: `Degeneracy` and `FlatRegions`, what was not in general position and what was done;
 - ``seconds``: import, lower, compile (loading or compiling the kernels), traverse, weld, certify, polish, check, write;
   flat (looking for regions of zeros), and perturb where planes coincide;
@@ -45,7 +45,7 @@ from mn_onnx.checks.residual import Residuals
 from mn_onnx.extract.invariants import Invariants
 from mn_onnx.extract.pipeline import Extraction
 from mn_onnx.model import Model
-from mn_onnx.profile import profile_entries
+from mn_onnx.profile import layer_entries, profile_entries
 
 
 def model_entries(model: Model) -> dict[str, Any]:
@@ -109,7 +109,11 @@ def build_report(
         "polish": None if polish is None else dict(polish),
         "nodes": statistics.nodes,
         "threads": statistics.threads,
-        "traversal": {**asdict(statistics), "profile": profile_entries(statistics.profile)},
+        "traversal": {
+            **asdict(statistics),
+            "profile": profile_entries(statistics.profile),
+            "layers": layer_entries(statistics.layers),
+        },
         "degeneracy": asdict(found.degeneracy),
         "flat_regions": asdict(found.flat_regions),
         "seconds": dict(seconds),

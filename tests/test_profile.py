@@ -10,7 +10,7 @@ import pytest
 from small_models import octahedron_model
 
 from mn_onnx.cli import main
-from mn_onnx.profile import profile_entries, profile_text
+from mn_onnx.profile import layer_entries, profile_entries, profile_text
 
 
 def test_groups_are_powers_of_two_of_units() -> None:
@@ -20,7 +20,8 @@ def test_groups_are_powers_of_two_of_units() -> None:
         {"units": [1, 1], "cells": 2, "share": 0.3, "cycles_per_cell": 150.0},
         {"units": [4, 7], "cells": 5, "share": 0.6, "cycles_per_cell": 120.0},
     ]
-    assert profile_entries(None) == []
+    assert profile_entries(None) == layer_entries(None) == []
+    assert [group["layers"] for group in layer_entries(profile)] == [0, 1, 3]
 
 
 def test_profile_goes_to_standard_error_and_into_the_report(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -30,9 +31,10 @@ def test_profile_goes_to_standard_error_and_into_the_report(tmp_path: Path, caps
     assert main([*arguments, "--profile"]) == 0
     out, err = capsys.readouterr()
     report = json.loads(report_file.read_text())
-    groups = report["traversal"]["profile"]
-    assert sum(group["cells"] for group in groups) == report["nodes"]
-    assert sum(group["share"] for group in groups) == pytest.approx(1)
+    for groups in (report["traversal"]["profile"], report["traversal"]["layers"]):
+        assert sum(group["cells"] for group in groups) == report["nodes"]
+        assert sum(group["share"] for group in groups) == pytest.approx(1)
+    assert max(group["layers"] for group in report["traversal"]["layers"]) == 1  # the octahedron's three units are one
     assert err == profile_text(report) + "\n"
     for phase in report["seconds"]:
         assert phase in err

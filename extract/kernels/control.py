@@ -6,6 +6,6 @@ from __future__ import annotations
     range(13)
 )
 (BROKEN_CUTS, DEEPEST, NEED_CORNERS, NEED_POLYGONS, PROFILE) = range(13, 18)
-# Per power of two of unstable units: nodes, cycles.
+# Nodes and cycles per power of two of unstable units, then per number of layers that have any.
 PROFILE_BINS = 16
-CONTROL_SIZE = PROFILE + 2 * PROFILE_BINS
+CONTROL_SIZE = PROFILE + 4 * PROFILE_BINS

@@ -286,6 +286,10 @@ def march(worker, tables, output, budget):
         while units > 0:
             bin_ += 1
             units >>= 1
+        layers = min(levels, PROFILE_BINS - 1)
+        spent = cycles() - before
         control[PROFILE + bin_] += 1
-        control[PROFILE + PROFILE_BINS + bin_] += cycles() - before
+        control[PROFILE + PROFILE_BINS + bin_] += spent
+        control[PROFILE + 2 * PROFILE_BINS + layers] += 1
+        control[PROFILE + 3 * PROFILE_BINS + layers] += spent
     return DONE
