@@ -102,7 +102,7 @@ class _Worker:
     """Owns arenas, and runs one task at a time."""
 
     def __init__(self, packed: Packed) -> None:
-        largest = max(packed.rows, symbol_stride(packed.cols, packed.levels)) + 8
+        largest = max(packed.rows, symbol_stride(packed.cols)) + 8
         self.packed = packed
         self.F = _aligned_floats(max(1 << 16, 2 * packed.F.size))
         self.N = np.empty(max(1 << 16, 2 * packed.N.size), np.int64)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -29,7 +30,7 @@ from mn_onnx.extract.kernels.memory import (
 )
 from mn_onnx.extract.pack import Packed, pack
 from mn_onnx.extract.schedule import traverse
-from mn_onnx.ir.network import Network
+from mn_onnx.ir.network import AffineRow, Network
 from mn_onnx.ir.passes import canonicalize
 from oracle.random_networks import random_tables
 
@@ -51,9 +52,9 @@ def _bound(F: Any, N: Any, X: Any, J: Any, tables: Any, cell: int, scratch: int,
 
 def _radii(packed: Packed, tracked: bool) -> tuple[Floats, Floats, Floats]:
     """Lowest and highest centre and the radius of every unit, in the packed order."""
-    room = max(packed.rows, symbol_stride(packed.cols, packed.levels)) + 8
+    room = max(packed.rows, symbol_stride(packed.cols)) + 8
     X, J = np.zeros(X_REGIONS * room), np.zeros(J_REGIONS * room, np.int64)
-    F = np.concatenate([packed.F, np.zeros(tracking_floats(packed.rows, packed.cols, packed.levels))])
+    F = np.concatenate([packed.F, np.zeros(tracking_floats(packed.rows, packed.cols))])
     _bound(F, packed.N, X, J, packed.tables, packed.root, packed.F.size, tracked)
     row_unit = packed.N[SYS_HEADER + packed.levels + 1 :][: packed.rows]
     rows = np.flatnonzero(row_unit >= 0)
@@ -83,6 +84,65 @@ def test_tracked_errors_enclose_units_more_tightly(layers: list[int]) -> None:
     assert np.all(tracked <= summed)
     assert np.array_equal(tracked == 0.0, summed == 0.0)
     assert tracked[-3:].max() < 0.5 * summed[-3:].max()
+
+
+def _radii_by_zonotopes(network: Network) -> Floats:
+    """Radii of the units of dense layers of ReLU: from tables of every unit's own error, in float64."""
+    corners = np.array([[(LOWER, UPPER)[(k >> axis) & 1][axis] for axis in range(3)] for k in range(8)])
+    centres, errors, radii = np.zeros((3 + len(network.units), 4)), np.zeros((3 + len(network.units), 0)), []
+    centres[:3, :3] = np.eye(3)
+    for g, unit in enumerate(network.units):
+        weights = unit.row.weights
+        centre = weights @ centres[unit.row.columns] + [0.0, 0.0, 0.0, unit.row.bias]
+        error = weights @ errors[unit.row.columns]
+        radii.append(np.abs(error).sum())
+        values = corners @ centre[:3] + centre[3]
+        low, high = values.min() - radii[-1], values.max() + radii[-1]
+        slope = np.clip(high, 0.0, None) / (high - low) if low < 0.0 else 1.0
+        own = max(-0.5 * slope * low, 0.0)
+        centres[3 + g] = slope * centre + [0.0, 0.0, 0.0, own]
+        errors = np.hstack([errors, np.zeros((len(errors), 1))])
+        errors[3 + g] = np.append(slope * error, own)
+    return np.array(radii)
+
+
+@pytest.mark.parametrize("layers", [[12] * 6, [40, 33, 50, 7, 45, 41]], ids=str)
+def test_tracked_errors_are_those_of_zonotopes_but_for_rounding(layers: list[int]) -> None:
+    network = dense(layers, seed=8)
+    expected = _radii_by_zonotopes(network)
+    packed = pack(canonicalize(network, lower=LOWER, upper=UPPER).network, LOWER, UPPER)
+    _, _, tracked = _radii(packed, True)
+    _, _, summed = _radii(packed, False)
+    assert np.all(tracked >= expected * (1.0 - 1e-9))
+    assert np.all(tracked <= expected + 1e-3 * summed)
+
+
+@pytest.mark.parametrize("power", [-100, -50, 50, 140])
+def test_errors_too_large_or_small_for_float32_are_not_tracked(power: int) -> None:
+    plain = canonicalize(dense([16] * 6, seed=5), lower=LOWER, upper=UPPER).network
+    scaled = _rescaled(plain, 16, 2.0**power)
+    _, _, tracked = _radii(pack(plain, LOWER, UPPER), True)
+    low, high, radius = _radii(pack(scaled, LOWER, UPPER), True)
+    _, _, summed = _radii(pack(scaled, LOWER, UPPER), False)
+    assert np.array_equal(radius, summed)
+    assert np.all(radius[32:] >= tracked[32:])
+    values = _pre_activations(scaled, np.random.default_rng(2).uniform(LOWER, UPPER, (500, 3)))
+    margin = 1e-12 * (np.abs(low) + np.abs(high))
+    assert np.all(values >= (low - radius - margin)[:, None])
+    assert np.all(values <= (high + radius + margin)[:, None])
+
+
+def _rescaled(network: Network, width: int, factor: float) -> Network:
+    """The same function of ReLU units, those of the first ``width`` times ``factor``."""
+    scale = np.ones(3 + len(network.units))
+    scale[3 : 3 + width] = factor
+    units = []
+    for g, unit in enumerate(network.units):
+        row, own = unit.row, scale[3 + g]
+        weights = row.weights * own / scale[row.columns]
+        units.append(replace(unit, row=AffineRow(row.columns, weights, row.bias * own)))
+    out = network.output
+    return Network(3, tuple(units), AffineRow(out.columns, out.weights / scale[out.columns], out.bias))
 
 
 def test_tracked_errors_enclose_units_of_several_outputs() -> None:

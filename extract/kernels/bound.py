@@ -176,12 +176,13 @@ def bound_units(F, N, X, J, M, tables, cell, system, floats, scratch, tracked):
     row_col = row_unit + rows
     col_end = row_col + rows + 1 + 2 * cols
     weights = weights_of(floats, rows)
-    stride = symbol_stride(cols, levels)
-    errors = aligned(scratch)
+    stride = symbol_stride(cols)
+    errors = 2 * aligned(scratch)  # in float32
     carried = errors + rows * stride
     read = carried + cols * stride
     J[LEVEL_OUTPUT * M] = J[LEVEL_SYMBOL * M] = 0
     first, count, linear, dead = np.int64(0), np.int64(0), 0, 0
+    rounding = 0.0
     for level in range(levels):
         begin, end = N[level_start + level], N[level_start + level + 1]
         # The outputs that no later row reads are at the front: extents only grow with the level.
@@ -189,7 +190,9 @@ def bound_units(F, N, X, J, M, tables, cell, system, floats, scratch, tracked):
             first += 1
         read_outputs(F, X, J, M, floats, rows, begin, end, first, count)
         if tracked:
-            track_errors(F, X, J, M, weights, begin, end, level, first, count, errors, carried, stride, read)
+            rounding = track_errors(
+                F, X, J, M, weights, begin, end, level, first, count, errors, carried, stride, read, rounding
+            )
         else:
             for r in range(begin, end, 4):
                 store(X, RADIUS * M + r, load(X, GROWTH * M + r))
@@ -201,8 +204,23 @@ def bound_units(F, N, X, J, M, tables, cell, system, floats, scratch, tracked):
         linear += new_linear
         dead += new_dead
         if tracked:
-            pass_errors_on(F, X, J, M, level, before, count, errors, carried, stride)
+            tracked = pass_errors_on(F, X, J, M, level, before, count, errors, carried, stride)
     return linear, dead
+
+
+@njit(cache=True, error_model="numpy")
+def bound_first_level(F, N, X, J, M, tables, cell, system, floats):
+    """`bound_units` for the first level only, where every row is affine; later rows keep their states."""
+    rows, levels = N[system + SYS_ROWS], N[system + SYS_LEVELS]
+    level_start = system + SYS_HEADER
+    row_unit = level_start + levels + 1
+    end = N[level_start + 1]
+    zero = np.int64(0)
+    read_outputs(F, X, J, M, floats, rows, zero, end, zero, zero)
+    for r in range(rows):
+        X[RADIUS * M + r] = 0.0 if r < end else np.inf
+    row_extremes(F, N, X, M, cell, zero, end)
+    settle_rows(F, N, X, J, M, tables, row_unit, row_unit + rows, floats, rows, zero, end, FIRST, zero)
 
 
 @njit(cache=True, error_model="numpy")

@@ -2,9 +2,13 @@
 
 A radius summed level by level grows with the product of the layers' absolute weights: after eight layers it can be a
 hundred times what this gives. The same forms are in Singh et al., Fast and Effective Robustness Certification (NeurIPS
-2018). An unstable unit's error is a *symbol* in [-1, 1] times X[SYMBOL_ERROR]; every row has a coefficient for each
-symbol before it, and its radius is the sum of their magnitudes. The cost is the cube of the number of units, so this is
-for deep systems only, and not for every cell.
+2018). The error of an unstable unit is a *symbol*, a value in [-1, 1]; every row has a coefficient for each symbol
+before it, and its radius is the sum of their magnitudes. The cost is the cube of the number of units, so this is for
+deep systems only, and not for every cell.
+
+The tables are float32, and the radius is enlarged by the most that their rounding can have taken away: the magnitudes
+of all that is summed add up to no more than X[GROWTH], so n roundings in a row take at most n halves of a unit in the
+last place of that (Higham, Accuracy and Stability of Numerical Algorithms, section 3.1).
 """
 
 from __future__ import annotations
@@ -12,7 +16,17 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from mn_onnx.extract.kernels.lanes import fma, load, magnitude, splat, store, total
+from mn_onnx.extract.kernels.lanes import (
+    as_singles,
+    fma,
+    load,
+    load_singles,
+    magnitude,
+    round_to_singles,
+    splat_singles,
+    store,
+    total,
+)
 from mn_onnx.extract.kernels.memory import (
     ERROR,
     GROWTH,
@@ -23,92 +37,130 @@ from mn_onnx.extract.kernels.memory import (
     READ_COLS,
     READ_ROW,
     SLOPE,
-    SYMBOL_AT,
-    SYMBOL_ERROR,
     symbol_stride,
 )
-from mn_onnx.extract.kernels.products import accumulate_four
 from mn_onnx.extract.kernels.relax import MARGIN
 
-
-@njit(cache=True, error_model="numpy")
-def start_errors(F, X, J, M, weights, target, stride, begin, symbols):
-    """The errors that four rows read directly: from symbol ``begin`` on each unit's own; no row reads those before."""
-    for k in range(4):
-        for s in range(begin):
-            F[target + k * stride + s] = 0.0
-    for s in range(begin, symbols):
-        error = X[SYMBOL_ERROR * M + s]
-        at = weights + J[SYMBOL_AT * M + s]
-        for k in range(4):
-            F[target + k * stride + s] = error * F[at + k]
+# Half a unit in the last place of float32, and a little for products of several such errors.
+ROUNDING = 1.05 * 2.0**-24
+# Errors are tracked as long as all of them add up to numbers in this range: there float32 is far from both its ends.
+SMALLEST, LARGEST = 2.0**-40, 2.0**40
+# So many outputs of a tile stay in the nearest cache.
+PANEL = 192
 
 
 @njit(cache=True, error_model="numpy")
-def sum_errors(F, X, M, target, row, symbols):
+def add_tile(E, target, stride, gathered, count, weights, fresh):
+    """32 symbols of four rows: what the rows read of ``count`` outputs, added to E[target] unless ``fresh``.
+
+    ``gathered``: the first output's entry of the first symbol; ``weights``: four for each output.
+    """
+    t1, t2, t3 = target + stride, target + 2 * stride, target + 3 * stride
+    zero = splat_singles(np.float32(0.0))
+    a0, a1, a2, a3 = zero, zero, zero, zero
+    b0, b1, b2, b3 = zero, zero, zero, zero
+    if not fresh:
+        a0, a1, a2, a3 = load_singles(E, target), load_singles(E, t1), load_singles(E, t2), load_singles(E, t3)
+        b0, b1 = load_singles(E, target + 16), load_singles(E, t1 + 16)
+        b2, b3 = load_singles(E, t2 + 16), load_singles(E, t3 + 16)
+    for _ in range(count):
+        u, v = load_singles(E, gathered), load_singles(E, gathered + 16)
+        w0, w1 = splat_singles(E[weights]), splat_singles(E[weights + 1])
+        w2, w3 = splat_singles(E[weights + 2]), splat_singles(E[weights + 3])
+        a0, b0 = fma(w0, u, a0), fma(w0, v, b0)
+        a1, b1 = fma(w1, u, a1), fma(w1, v, b1)
+        a2, b2 = fma(w2, u, a2), fma(w2, v, b2)
+        a3, b3 = fma(w3, u, a3), fma(w3, v, b3)
+        gathered += stride
+        weights += 4
+    store(E, target, a0)
+    store(E, t1, a1)
+    store(E, t2, a2)
+    store(E, t3, a3)
+    store(E, target + 16, b0)
+    store(E, t1 + 16, b1)
+    store(E, t2 + 16, b2)
+    store(E, t3 + 16, b3)
+
+
+@njit(cache=True, error_model="numpy")
+def sum_errors(E, X, M, row, target, symbols, rounding):
     """X[RADIUS] of a row: the sum of its errors' magnitudes, with their rounding, at most X[GROWTH]."""
-    one, summed = splat(1.0), splat(0.0)
-    for s in range(0, symbols, 4):
-        summed = fma(one, magnitude(load(F, target + s)), summed)
+    one, summed = splat_singles(np.float32(1.0)), splat_singles(np.float32(0.0))
+    for s in range(0, symbols, 16):
+        summed = fma(one, magnitude(load_singles(E, target + s)), summed)
     growth = X[GROWTH * M + row]
-    X[RADIUS * M + row] = min(growth, total(summed) + MARGIN * growth)
+    radius = total(summed) + (rounding + MARGIN) * growth
+    X[RADIUS * M + row] = radius if radius < growth else growth
 
 
 @njit(cache=True, error_model="numpy")
-def track_errors(F, X, J, M, weights, begin, end, level, first, count, errors, carried, stride, read):
+def track_errors(F, X, J, M, weights, begin, end, level, first, count, errors, carried, stride, read, rounding):
     """Radii of rows ``begin:end`` of a level from the error of every single unit before.
 
-    ``weights``: F's index of the columns. ``first:count``: the outputs that the rows read. The rows' table of errors
-    starts at F[errors], the outputs' at F[carried], ``stride`` numbers for each row or output; F[read] is scratch of
-    a number for each row and output.
+    ``weights``: F's index of the columns. ``first:count``: the outputs that the rows read. In F as float32, the rows'
+    table of errors starts at ``errors``, the outputs' at ``carried``, ``stride`` numbers for each row or output;
+    ``read`` is scratch of a number for each row and output. ``rounding``: how many roundings a number of the outputs'
+    table may have had, as a share of X[GROWTH]; returns the same of the rows'.
     """
-    symbols = J[LEVEL_SYMBOL * M + level]
-    # Errors of levels whose outputs no row reads any more come through other outputs only.
-    own = 0
-    while own < level and J[LEVEL_OUTPUT * M + own + 1] <= first:
-        own += 1
-    outputs = count - first
+    E = as_singles(F)
+    symbols, outputs = J[LEVEL_SYMBOL * M + level], count - first
     for r in range(begin, end, 4):
         block = read + (r - begin) * outputs
         for p in range(first, count):
-            store(F, block + 4 * (p - first), load(F, weights + J[READ_AT * M + p] + r))
-        start_errors(F, X, J, M, weights + r, errors + r * stride, stride, J[LEVEL_SYMBOL * M + own], symbols)
-    four, blocks = np.int64(4), (end - begin) >> 2
-    for earlier in range(level - 1):
-        start, stop = J[LEVEL_SYMBOL * M + earlier], J[LEVEL_SYMBOL * M + earlier + 1]
-        if start < stop:
-            since = max(first, J[LEVEL_OUTPUT * M + earlier + 1])
-            accumulate_four(
-                F, errors + begin * stride, start, stop, stride, carried, since, count,
-                read - 4 * first, four, blocks, 4 * stride, 4 * outputs,
-            )  # fmt: skip
+            store(E, block, round_to_singles(load(F, weights + J[READ_AT * M + p] + r)))
+            block += 4
+    earlier = 0
+    for q in range(0, symbols, 32):
+        # Outputs of levels before the tile's first symbol have no error of it.
+        while J[LEVEL_SYMBOL * M + earlier + 1] <= q:
+            earlier += 1
+        since = max(first, J[LEVEL_OUTPUT * M + earlier])
+        p = since
+        while p == since or p < count:
+            n = min(PANEL, count - p)
+            for r in range(begin, end, 4):
+                at = read + (r - begin) * outputs + 4 * (p - first)
+                add_tile(E, errors + r * stride + q, stride, carried + p * stride + q, n, at, p == since)
+            p += PANEL
+    rounding += ROUNDING * (outputs + (symbols >> 4) + 16)
     for r in range(begin, end):
-        sum_errors(F, X, M, errors + r * stride, r, symbols)
+        sum_errors(E, X, M, r, errors + r * stride, symbols, rounding)
+    return rounding
 
 
 @njit(cache=True, error_model="numpy")
 def pass_errors_on(F, X, J, M, level, begin, end, errors, carried, stride):
-    """The table of errors of outputs ``begin:end`` of a level, and a symbol for each that has an error of its own."""
+    """The table of errors of outputs ``begin:end`` of a level, and a symbol for each that has an error of its own.
+
+    Returns whether all errors are of a size for float32.
+    """
+    E = as_singles(F)
     known = J[LEVEL_SYMBOL * M + level]
-    symbols = known
+    symbols, fit = known, True
     for p in range(begin, end):
-        c = J[READ_COLS * M + p]
-        slope, zero = splat(X[SLOPE * M + c]), splat(0.0)
-        source, target = errors + J[READ_ROW * M + p] * stride, carried + p * stride
-        for s in range(0, known, 4):
-            store(F, target + s, fma(slope, load(F, source + s), zero))
-        X[SYMBOL_ERROR * M + symbols] = X[ERROR * M + c]
-        J[SYMBOL_AT * M + symbols] = J[READ_AT * M + p]
-        symbols += X[ERROR * M + c] > 0.0
-    while symbols & 7:
-        X[SYMBOL_ERROR * M + symbols] = 0.0
-        J[SYMBOL_AT * M + symbols] = J[SYMBOL_AT * M + symbols - 1]
-        symbols += 1
+        symbols += X[ERROR * M + J[READ_COLS * M + p]] > 0.0
     J[LEVEL_OUTPUT * M + level + 1] = end
     J[LEVEL_SYMBOL * M + level + 1] = symbols
+    zero, symbol = splat_singles(np.float32(0.0)), known
+    for p in range(begin, end):
+        c, r = J[READ_COLS * M + p], J[READ_ROW * M + p]
+        slope = splat_singles(np.float32(X[SLOPE * M + c]))
+        source, target = errors + r * stride, carried + p * stride
+        for s in range(0, known, 16):
+            store(E, target + s, fma(slope, load_singles(E, source + s), zero))
+        for s in range((known + 15) & ~15, (symbols + 31) & ~31, 16):
+            store(E, target + s, zero)
+        error = X[ERROR * M + c]
+        growth = abs(X[SLOPE * M + c]) * X[GROWTH * M + r] + error
+        fit &= (growth == 0.0) | ((growth > SMALLEST) & (growth < LARGEST))
+        if error > 0.0:
+            E[target + symbol] = np.float32(error)
+            symbol += 1
+    return fit
 
 
 @njit(cache=True, error_model="numpy")
-def tracking_floats(rows, cols, levels):
+def tracking_floats(rows, cols):
     """Number of float64 that the tables of errors of a system take in scratch."""
-    return (rows + cols) * symbol_stride(cols, levels) + rows * cols + 8
+    return ((rows + cols) * symbol_stride(cols) + rows * cols) // 2 + 24

@@ -18,20 +18,23 @@ from numba.extending import intrinsic, models, register_model
 
 WIDTH = 4
 WIDE = 8
+SINGLES = 16
 
 _INT32 = ir.IntType(32)
 
 
 class LanesType(types.Type):
-    """The numba type of a vector of ``width`` float64."""
+    """The numba type of a vector of ``width`` numbers of an element type, float64 or float32."""
 
-    def __init__(self, width: int) -> None:
-        super().__init__(name=f"Lanes{width}")
-        self.vector = ir.VectorType(ir.DoubleType(), width)
+    def __init__(self, width: int, element: Any) -> None:
+        super().__init__(name=f"Lanes{width}{element}")
+        self.vector = ir.VectorType(element, width)
 
 
-lanes = LanesType(WIDTH)
-wide_lanes = LanesType(WIDE)
+lanes = LanesType(WIDTH, ir.DoubleType())
+wide_lanes = LanesType(WIDE, ir.DoubleType())
+four_singles = LanesType(WIDTH, ir.FloatType())
+singles = LanesType(SINGLES, ir.FloatType())
 
 
 @register_model(LanesType)
@@ -46,7 +49,8 @@ def _vector_pointer(builder: Any, vector: Any, pointer: Any, index: Any) -> Any:
 
 def _call(builder: Any, name: str, vector: Any, arguments: list[Any]) -> Any:
     signature = ir.FunctionType(vector, [vector] * len(arguments))
-    function = cgutils.get_or_insert_function(builder.module, signature, f"llvm.{name}.v{vector.count}f64")
+    bits = 64 if vector.element == ir.DoubleType() else 32
+    function = cgutils.get_or_insert_function(builder.module, signature, f"llvm.{name}.v{vector.count}f{bits}")
     return builder.call(function, arguments)
 
 
@@ -67,6 +71,42 @@ def pointer(typing_context: Any, array: Any) -> Any:
         return context.make_array(signature.args[0])(context, builder, arguments[0]).data
 
     return types.CPointer(array.dtype)(array), code
+
+
+@intrinsic
+def as_singles(typing_context: Any, source: Any) -> Any:
+    """The same memory as float32, two to every float64."""
+
+    def code(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        return builder.bitcast(arguments[0], ir.FloatType().as_pointer())
+
+    return types.CPointer(types.float32)(source), code
+
+
+@intrinsic
+def load_singles(typing_context: Any, source: Any, index: Any) -> Any:
+    """``source[index : index + SINGLES]`` through a pointer to float32."""
+
+    def code(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        return builder.load(_vector_pointer(builder, singles.vector, *arguments), align=4)
+
+    return singles(source, types.int64), code
+
+
+@intrinsic
+def splat_singles(typing_context: Any, value: Any) -> Any:
+    """The same number, rounded to float32, in `SINGLES` lanes."""
+    return singles(types.float32), _splat
+
+
+@intrinsic
+def round_to_singles(typing_context: Any, values: Any) -> Any:
+    """Four float64 rounded to float32."""
+
+    def code(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        return builder.fptrunc(arguments[0], four_singles.vector)
+
+    return four_singles(lanes), code
 
 
 @intrinsic
@@ -102,7 +142,8 @@ def store(typing_context: Any, target: Any, index: Any, value: Any) -> Any:
 
     def code(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         target, index, value = arguments
-        builder.store(value, _vector_pointer(builder, value.type, target, index), align=8)
+        align = 8 if value.type.element == ir.DoubleType() else 4
+        builder.store(value, _vector_pointer(builder, value.type, target, index), align=align)
         return context.get_dummy_value()
 
     return types.none(target, types.int64, value), code
@@ -206,7 +247,7 @@ def total(typing_context: Any, a: Any) -> Any:
         ends = [builder.extract_element(vector, ir.Constant(_INT32, k)) for k in range(2)]
         return builder.fadd(*ends)
 
-    return types.float64(a), code
+    return (types.float32 if a == singles else types.float64)(a), code
 
 
 @intrinsic

@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 from numba import njit
 
-from mn_onnx.extract.kernels.bound import bound_output, bound_units, settle_again, value_range
+from mn_onnx.extract.kernels.bound import bound_first_level, bound_output, bound_units, settle_again, value_range
 from mn_onnx.extract.kernels.control import (
     BROKEN_CUTS,
     DEEPEST,
@@ -78,9 +78,13 @@ DONE, BUDGET_USED, ARENA_FULL, SCRATCH_FULL, OUTPUT_FULL, STACK_FULL, STOPPED = 
 
 # Systems of fewer units are folded freely; see `how_to_fold`.
 SMALL_SYSTEM = 64
-# Errors are tracked one by one in systems of so many levels, on cells of every third depth: where bounds are loose they
-# halve the cells, and cost as much as two cells.
-TRACKED_LEVELS, TRACKED_DEPTHS = 5, 3
+# In systems of so many levels and units, radii come from every unit's own error on cells of every third depth; such a
+# bound costs twice as much and settles twice as many units. Between them, larger systems are not bounded at all: what
+# summed radii settle there is not worth reading the weights.
+TRACKED_LEVELS, TRACKED_UNITS, TRACKED_DEPTHS = 5, 32, 3
+UNBOUNDED_UNITS = 128
+# How the units of a cell are bounded.
+SUMMED, TRACKED, FIRST_LEVEL = 0, 1, 2
 
 
 class Room(NamedTuple):
@@ -131,7 +135,7 @@ def missing_room(N, control, room, counts, cell, rows, cols, levels):
     # adds at most that; a cell is cut three times at most: trimmed on two sides, then split.
     most = 4 * vertices + 16
     choices = control[LEAF_CHOICES]
-    tracking = tracking_floats(rows, cols, levels) if levels >= TRACKED_LEVELS else 0
+    tracking = tracking_floats(rows, cols) if levels >= TRACKED_LEVELS else 0
     need_f = control[TOP_F] + max(tracking, folding_floats(rows, cols) + 12 * padded(most))
     need_i = control[TOP_I] + system_ints(rows, cols, levels) + 4 * cell_ints(rows, most)
     if need_f > room.floats or need_i > room.integers:
@@ -179,9 +183,14 @@ def how_to_fold(N, system, linear, dead):
 
 
 @njit(cache=True, error_model="numpy")
-def is_tracked(N, cell, system):
-    """Whether the bounds of this cell come from every unit's own error."""
-    return N[system + SYS_LEVELS] >= TRACKED_LEVELS and N[cell + CELL_DEPTH] % TRACKED_DEPTHS == 0
+def how_to_bound(N, cell, system):
+    """TRACKED for bounds from every unit's own error, SUMMED for sums of errors, FIRST_LEVEL for affine rows only."""
+    units = N[system + SYS_UNITS]
+    if N[system + SYS_LEVELS] < TRACKED_LEVELS or units < TRACKED_UNITS:
+        return SUMMED
+    if N[cell + CELL_DEPTH] % TRACKED_DEPTHS == 0:
+        return TRACKED
+    return FIRST_LEVEL if units >= UNBOUNDED_UNITS else SUMMED
 
 
 @njit(cache=True, error_model="numpy")
@@ -200,7 +209,14 @@ def visit(F, N, X, J, M, control, stack, output, tables, slot_of_tag, cell):
     for r in range(rows):
         J[STATE_LOW * M + r] = N[states + r]
         J[STATE_HIGH * M + r] = N[states + rows + r]
-    tracked = is_tracked(N, cell, system)
+    how = how_to_bound(N, cell, system)
+    if how == FIRST_LEVEL:
+        bound_first_level(F, N, X, J, M, tables, cell, system, floats)
+        row, knot = choose_split(N, X, J, M, tables, system)
+        if row >= 0:
+            split_cell(F, N, X, J, M, control, stack, tables, slot_of_tag, cell, rows, system, floats, row, row, knot)
+            return
+    tracked = how != SUMMED
     linear, dead = bound_units(F, N, X, J, M, tables, cell, system, floats, control[TOP_F], tracked)
     radius = bound_output(F, N, X, M, system, floats)
     at = CENTRE_AT * M

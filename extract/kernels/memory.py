@@ -39,8 +39,8 @@ CELL_END_F, CELL_END_I, CELL_DEPTH, CELL_HEADER = 5, 6, 7, 8
 (CENTRE, RADIUS, LOW, HIGH, SLOPE, OFFSET, ERROR, OUT_COEF) = (0, 4, 5, 6, 7, 8, 9, 10)
 (POLY_VALUES, CUT_X, CUT_Y, CUT_Z, CENTRE_AT, FORMS) = (19, 20, 21, 22, 23, 24)
 OUTPUTS = 28  # five
-CUT_SHARE, GROWTH, SYMBOL_ERROR, SETTLED_SLOPE = 33, 34, 35, 36
-X_REGIONS = 37
+CUT_SHARE, GROWTH, SETTLED_SLOPE = 33, 34, 35
+X_REGIONS = 36
 # Kernels are called with these. numba compiles a kernel once more for every constant among its arguments, except for
 # numpy's: so their numbers are numpy's, as are the constants in the kernels' calls of each other.
 VALUES, OUT_VALUES, POLY_A, POLY_B = np.int64(11), np.int64(12), np.int64(13), np.int64(16)
@@ -50,9 +50,9 @@ VALUES, OUT_VALUES, POLY_A, POLY_B = np.int64(11), np.int64(12), np.int64(13), n
 TAGS_A, TAGS_B = np.int64(8), np.int64(9)  # kernels are called with them
 (CUT_TO, KEPT_ROWS, STABLE_COLS, CHOICE, CHOICE_FIRST, CHOICE_LAST) = (10, 11, 12, 13, 14, 15)
 (READ_COLS, READ_AT, KIND, BELOW, ABOVE, SIDE_COUNTS) = (16, 17, 18, 19, 20, 21)
-(SYMBOL_AT, LEVEL_OUTPUT, LEVEL_SYMBOL, READ_ROW) = (22, 23, 24, 25)
-(KEPT, PLACE, OLD_COL, SETTLED_ROW, COL_KIND) = (26, 27, 28, 29, 30)
-J_REGIONS = 31
+(LEVEL_OUTPUT, LEVEL_SYMBOL, READ_ROW) = (22, 23, 24)
+(KEPT, PLACE, OLD_COL, SETTLED_ROW, COL_KIND) = (25, 26, 27, 28, 29)
+J_REGIONS = 30
 
 # What F has for every row of a system, apart from the weights: the affine part, and the two pieces around its knot.
 PIECE_FLOATS = 5
@@ -109,12 +109,12 @@ def cell_ints(rows: int, vertices: int) -> int:
 
 
 @njit(cache=True, error_model="numpy")
-def symbol_stride(cols: int, levels: int) -> int:
-    """Room for the error symbols of a system: one a column, padded level by level to cache lines.
+def symbol_stride(cols: int) -> int:
+    """Room, in float32, for the error symbols of a system: at most one a column, padded to the tiles of products.
 
-    An odd number of lines: with many a power of two, rows of the same column would compete for one place in the cache.
+    An odd number of cache lines: with many a power of two, rows of the same symbol would compete for one place.
     """
-    return aligned(cols + 8 * levels) | 8
+    return (cols + 31) & ~31 | 16
 
 
 @njit(cache=True, error_model="numpy")
