@@ -20,6 +20,7 @@ from mn_onnx.extract.kernels.lanes import (
     load_like,
     load_wide,
     magnitude,
+    prefetch,
     smaller,
     splat,
     splat_like,
@@ -108,6 +109,9 @@ def read_outputs(F, X, J, M, floats, rows, begin, end, first, count):
         for p in range(first, count):
             at = weights + J[places + p] + r
             w, v = load_wide(F, at), load_wide(F, at + 8)
+            # The next rows' weights: a column is a page or more, so the machine would not foresee them.
+            prefetch(F, at + 16)
+            prefetch(F, at + 24)
             y = outputs + p
             y0, y1, y2, y3, y4 = (
                 splat_wide(X[y]),

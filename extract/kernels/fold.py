@@ -53,6 +53,8 @@ from mn_onnx.extract.kernels.products import accumulate, accumulate_four
 
 # `gather_column` writes up to so many numbers after the last one.
 OVERWRITTEN = 8
+# So many columns are written at a time; see `write_columns`.
+COLUMN_BLOCK = 8
 ONE, FOUR = np.int64(1), np.int64(4)  # of numpy's, see `memory`
 
 
@@ -165,8 +167,14 @@ def gather_column(F, J, M, source, begin, rows, target):
 
 
 @njit(cache=True, error_model="numpy")
-def multiply_settled(F, N, J, M, folded, weights, gathered, settled, work, stride):
-    """Add to every kept column what the rows read of it through the settled ones, four columns of a level at a time."""
+def write_columns(F, N, J, M, system, floats, folded, weights, gathered, settled, work, stride):
+    """Write the folded system's columns: the kept ones, and what the rows read of them through the settled ones.
+
+    A block of columns at a time, which is still in the nearer caches when it is added to.
+    """
+    old_rows = N[system + SYS_ROWS]
+    old_begin = system + SYS_HEADER + N[system + SYS_LEVELS] + 1 + 2 * old_rows + 1 + N[system + SYS_COLS]
+    old_weights = weights_of(floats, old_rows)
     rows, cols = N[folded + SYS_ROWS], N[folded + SYS_COLS]
     new_col_row = folded + SYS_HEADER + N[folded + SYS_LEVELS] + 1 + 2 * rows + 1
     col_begin = new_col_row + cols
@@ -178,8 +186,12 @@ def multiply_settled(F, N, J, M, folded, weights, gathered, settled, work, strid
             first += 1
         begin = N[col_begin + k]
         last = k
-        while last < cols and N[col_begin + last] == begin:
+        while last < cols and last < k + COLUMN_BLOCK and N[col_begin + last] == begin:
             last += 1
+        for column in range(k, last):
+            old = J[OLD_COL * M + column]
+            source, target = old_weights + old * old_rows, weights + column * rows
+            gather_column(F, J, M, source, N[old_begin + old], old_rows, target)
         fours = (last - k) >> 2
         accumulate_four(
             F, weights + k * rows, begin, rows, rows, gathered, first, settled, work + k, stride, fours, 4 * rows, FOUR
@@ -222,12 +234,9 @@ def fold(F, N, X, J, M, system, floats, folded, folded_floats, least):
     new_weights = weights_of(folded_floats, new_rows)
     new_out = new_weights + new_cols * new_rows
     out_weights = weights + cols * rows
-    for k in range(new_cols):
-        column = weights + J[OLD_COL * M + k] * rows
-        gather_column(F, J, M, column, N[col_begin + J[OLD_COL * M + k]], rows, new_weights + k * new_rows)
+    write_columns(F, N, J, M, system, floats, folded, new_weights, gathered, settled, work + 4, stride)
     for k in range(new_cols):
         F[new_out + k] = F[out_weights + J[OLD_COL * M + k]]
-    multiply_settled(F, N, J, M, folded, new_weights, gathered, settled, work + 4, stride)
     out, new_constant = out_weights + padded(cols), new_out + padded(new_cols)
     for axis in range(4):
         F[new_constant + axis] = F[out + axis]

@@ -150,6 +150,20 @@ def store(typing_context: Any, target: Any, index: Any, value: Any) -> Any:
 
 
 @intrinsic
+def prefetch(typing_context: Any, source: Any, index: Any) -> Any:
+    """Ask for the cache line of ``source[index]`` to be brought into the second cache; any index is allowed."""
+
+    def code(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        address = builder.bitcast(builder.gep(arguments[0], [arguments[1]]), ir.IntType(8).as_pointer())
+        signature = ir.FunctionType(ir.VoidType(), [address.type, _INT32, _INT32, _INT32])
+        function = builder.module.declare_intrinsic("llvm.prefetch", [address.type], signature)
+        builder.call(function, [address, *(ir.Constant(_INT32, number) for number in (0, 2, 1))])
+        return context.get_dummy_value()
+
+    return types.none(source, types.int64), code
+
+
+@intrinsic
 def splat(typing_context: Any, value: Any) -> Any:
     """The same number in `WIDTH` lanes."""
     return lanes(types.float64), _splat
