@@ -27,6 +27,7 @@ from mn_onnx.extract.kernels.memory import (
     J_REGIONS,
     SYS_FLOATS,
     SYS_INTS,
+    SYS_UNITS,
     TRIMMED_DEPTHS,
     X_REGIONS,
     first_trim_tag,
@@ -41,6 +42,8 @@ Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
 LEAF_CHOICES = 8
+# Deep cells with this share of the network's units left are bounded at some depths only: one in so many.
+UNBOUNDED_SHARE = 4
 BUDGET = 4_000_000  # weights read between two looks at the world: some milliseconds
 BUFFER_CORNERS = 1 << 18
 
@@ -108,6 +111,7 @@ class _Worker:
         self.N = np.empty(max(1 << 16, 2 * packed.N.size), np.int64)
         self.control = np.zeros(entries.CONTROL_SIZE, np.int64)
         self.control[entries.LEAF_CHOICES] = LEAF_CHOICES
+        self.control[entries.UNBOUNDED_UNITS] = -(-int(packed.N[SYS_UNITS]) // UNBOUNDED_SHARE)
         self.stack = np.zeros(1024, np.int64)
         self.slot_of_tag = np.zeros(first_trim_tag(packed.tables.n_knots) + 2 * TRIMMED_DEPTHS, np.int64)
         self._set_scratch(max(512, -(-largest // 8) * 8))

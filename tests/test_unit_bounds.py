@@ -11,6 +11,7 @@ from ir_networks import dense, naive_values
 from numba import njit
 from numpy.typing import NDArray
 
+from mn_onnx.extract import schedule
 from mn_onnx.extract.kernels.bound import bound_units
 from mn_onnx.extract.kernels.error_symbols import tracking_floats
 from mn_onnx.extract.kernels.lanes import pointer
@@ -155,6 +156,21 @@ def test_tracked_errors_enclose_units_of_several_outputs() -> None:
     assert np.all(values >= (low - radius - 1e-12)[:, None])
     assert np.all(values <= (high + radius + 1e-12)[:, None])
     assert np.all(radius <= summed)
+
+
+def test_polygons_do_not_depend_on_how_often_cells_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
+    lower, upper = np.full(3, -1.0), np.full(3, 1.0)
+    network = canonicalize(dense([14] * 6, seed=11), lower=lower, upper=upper).network
+    results = []
+    for share in (1, 1000):
+        monkeypatch.setattr(schedule, "UNBOUNDED_SHARE", share)
+        results.append(traverse(network, lower, upper, threads=1))
+    (often, often_counts), (seldom, seldom_counts) = results
+    assert seldom_counts.nodes > often_counts.nodes
+    assert often.offsets.size > 100
+    # The polygons come in the order of the cells.
+    assert np.array_equal(np.sort(np.diff(often.offsets)), np.sort(np.diff(seldom.offsets)))
+    assert np.array_equal(np.unique(often.keys, axis=0), np.unique(seldom.keys, axis=0))
 
 
 def test_most_cells_of_a_curved_surface_are_trimmed() -> None:
