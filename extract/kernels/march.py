@@ -2,7 +2,7 @@
 
 A cell is bounded, dropped if the output cannot reach the level there, trimmed to where it can, folded when enough of
 its units have settled, and split along a knot of a unit whose pre-activation is already affine on it; small cells are
-emitted whole (`leaf`).
+emitted whole (`leaf`). In deep networks large cells are only split, at most depths: see `how_to_bound`.
 `march` returns to its caller, with the worker's state intact, when a budget of work is used up, when an arena or an
 output buffer might not have room for the next cell, or when it is told to stop.
 """
