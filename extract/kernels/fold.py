@@ -36,6 +36,7 @@ from mn_onnx.extract.kernels.memory import (
     ROW_FLOATS,
     SETTLED_ROW,
     SETTLED_SLOPE,
+    SINCE,
     SLOPE,
     STABLE_COLS,
     SYS_COLS,
@@ -44,18 +45,21 @@ from mn_onnx.extract.kernels.memory import (
     SYS_LEVELS,
     SYS_ROWS,
     UNSTABLE,
+    UNTIL,
     aligned,
     padded,
     system_floats,
     weights_of,
 )
-from mn_onnx.extract.kernels.products import accumulate, accumulate_four
+from mn_onnx.extract.kernels.products import accumulate
 
 # `gather_column` writes up to so many numbers after the last one.
 OVERWRITTEN = 8
 # So many columns are written at a time; see `write_columns`.
 COLUMN_BLOCK = 8
-ONE, FOUR = np.int64(1), np.int64(4)  # of numpy's, see `memory`
+# The widest tile of `products`: so far beyond its numbers a source is filled with zeros.
+TILE = 16
+FOUR = np.int64(4)  # of numpy's, see `memory`
 
 
 @njit(cache=True, error_model="numpy")
@@ -88,7 +92,7 @@ def read_settled_rows(F, N, X, J, M, system, floats, first, last, new_cols, work
     """What settled columns ``first : last``, of one level, read of the kept columns and the input, times their slope.
 
     For each, F[work + p * stride] and on: the four affine coefficients, then the new columns, padded. Returns how many
-    of these numbers are not zero for want of anything to read.
+    of these numbers are not zero for want of anything to read; after them come zeros for the length of a tile.
     """
     rows, cols = N[system + SYS_ROWS], N[system + SYS_COLS]
     col_begin = system + SYS_HEADER + N[system + SYS_LEVELS] + 1 + 2 * rows + 1 + cols
@@ -114,7 +118,8 @@ def read_settled_rows(F, N, X, J, M, system, floats, first, last, new_cols, work
         for axis in range(4):
             F[at + axis] = slope * F[floats + axis * rows + r]
         F[at + 3] += X[OFFSET * M + J[STABLE_COLS * M + p]]
-        for k in range(4 + padded(read), stride, 4):
+        J[SINCE * M + p], J[UNTIL * M + p] = 0, 4 + padded(read)
+        for k in range(4 + padded(read), min(stride, 4 + padded(read) + TILE), 4):
             store(F, at + k, zero)
         for k in range(4 + read, 4 + padded(read)):
             F[at + k] = 0.0
@@ -130,8 +135,9 @@ def express_settled_rows(F, N, X, J, M, system, floats, settled, new_cols, work,
     """
     rows, cols = N[system + SYS_ROWS], N[system + SYS_COLS]
     col_begin = system + SYS_HEADER + N[system + SYS_LEVELS] + 1 + 2 * rows + 1 + cols
+    col_end = col_begin + cols
     weights = weights_of(floats, rows)
-    zero = first = np.int64(0)
+    zero = first = read = np.int64(0)
     while first < settled:
         level_end = N[col_begin + J[STABLE_COLS * M + first]]
         last = first
@@ -139,19 +145,15 @@ def express_settled_rows(F, N, X, J, M, system, floats, settled, new_cols, work,
             last += 1
         used = read_settled_rows(F, N, X, J, M, system, floats, first, last, new_cols, work, stride)
         width = last - first
-        for e in range(first):
+        # Outputs that no row of this level reads are at the front.
+        while read < first and N[col_end + J[STABLE_COLS * M + read]] <= J[SETTLED_ROW * M + first]:
+            read += 1
+        for e in range(read, first):
             source = weights + J[STABLE_COLS * M + e] * rows
             target = scratch + e * width - first
             for p in range(first, last):
                 F[target + p] = X[SETTLED_SLOPE * M + p] * F[source + J[SETTLED_ROW * M + p]]
-        fours = width >> 2
-        accumulate_four(
-            F, work + first * stride, zero, used, stride, work, zero, first, scratch, width, fours, 4 * stride, FOUR
-        )
-        p = first + 4 * fours
-        while p < last:
-            accumulate(F, work + p * stride, zero, used, stride, work, zero, first, scratch + p - first, width)
-            p += 1
+        accumulate(F, J, M, work + first * stride, width, zero, used, stride, work, read, first, scratch, width)
         first = last
 
 
@@ -178,27 +180,23 @@ def write_columns(F, N, J, M, system, floats, folded, weights, gathered, settled
     rows, cols = N[folded + SYS_ROWS], N[folded + SYS_COLS]
     new_col_row = folded + SYS_HEADER + N[folded + SYS_LEVELS] + 1 + 2 * rows + 1
     col_begin = new_col_row + cols
+    col_end = col_begin + cols
     first = k = np.int64(0)
     while k < cols:
         # Settled units of this column's level or before do not read it.
-        row = J[KEPT_ROWS * M + N[new_col_row + k]]
-        while first < settled and J[SETTLED_ROW * M + first] <= row:
+        level_end = N[old_begin + J[OLD_COL * M + k]]
+        while first < settled and J[SETTLED_ROW * M + first] < level_end:
             first += 1
-        begin = N[col_begin + k]
+        begin = end = N[col_begin + k]
         last = k
         while last < cols and last < k + COLUMN_BLOCK and N[col_begin + last] == begin:
+            end = max(end, N[col_end + last])
             last += 1
         for column in range(k, last):
             old = J[OLD_COL * M + column]
             source, target = old_weights + old * old_rows, weights + column * rows
             gather_column(F, J, M, source, N[old_begin + old], old_rows, target)
-        fours = (last - k) >> 2
-        accumulate_four(
-            F, weights + k * rows, begin, rows, rows, gathered, first, settled, work + k, stride, fours, 4 * rows, FOUR
-        )
-        for column in range(k + 4 * fours, last):
-            at = weights + column * rows
-            accumulate(F, at, begin, rows, rows, gathered, first, settled, work + column, stride)
+        accumulate(F, J, M, weights + k * rows, last - k, begin, end, rows, gathered, first, settled, work + k, stride)
         k = last
 
 
@@ -212,38 +210,49 @@ def fold(F, N, X, J, M, system, floats, folded, folded_floats, least):
     rows, cols = N[system + SYS_ROWS], N[system + SYS_COLS]
     row_col = system + SYS_HEADER + N[system + SYS_LEVELS] + 1 + rows
     col_begin = row_col + rows + 1 + cols
-    new_rows, new_cols = lay_out_folded(N, J, M, system, folded, least)
+    col_end = col_begin + cols
     settled = list_settled_columns(N, X, J, M, system, least)
+    new_rows, new_cols = lay_out_folded(N, J, M, system, folded, least, settled)
     stride = aligned(new_cols + 4)
     work = aligned(folded_floats + N[folded + SYS_FLOATS] + OVERWRITTEN)
     gathered = work + settled * stride
     express_settled_rows(F, N, X, J, M, system, floats, settled, new_cols, work, stride, gathered)
     weights = weights_of(floats, rows)
-    zero = begin = np.int64(0)
+    out_weights = weights + cols * rows
+    new_weights = weights_of(folded_floats, new_rows)
+    new_out = new_weights + new_cols * new_rows
+    zero = begin = end = old_end = np.int64(0)
     for p in range(settled):
         c = J[STABLE_COLS * M + p]
         # Later rows only: a settled column is read by no row of its own level or before.
         while begin < new_rows and J[KEPT_ROWS * M + begin] < N[col_begin + c]:
             begin += 1
-        gather_column(F, J, M, weights + c * rows, N[col_begin + c], rows, gathered + p * new_rows)
-        for q in range(0, begin, 4):
+        old_end = max(old_end, N[col_end + c])
+        while end < new_rows and J[KEPT_ROWS * M + end] < old_end:
+            end += 1
+        end = min(padded(end), new_rows)
+        gather_column(F, J, M, weights + c * rows, N[col_begin + c], old_end, gathered + p * new_rows)
+        for q in range(max(begin - TILE, 0), begin, 4):
             store(F, gathered + p * new_rows + q, splat(0.0))
+        for q in range(end, min(end + TILE, new_rows), 4):
+            store(F, gathered + p * new_rows + q, splat(0.0))
+        J[SINCE * M + p], J[UNTIL * M + p] = begin, end
     for k in range(ROW_FLOATS):
         gather_column(F, J, M, floats + k * rows, zero, rows, folded_floats + k * new_rows)
-    accumulate_four(F, folded_floats, zero, new_rows, new_rows, gathered, zero, settled, work, stride, ONE, zero, zero)
-    new_weights = weights_of(folded_floats, new_rows)
-    new_out = new_weights + new_cols * new_rows
-    out_weights = weights + cols * rows
+    accumulate(F, J, M, folded_floats, FOUR, zero, new_rows, new_rows, gathered, zero, settled, work, stride)
     write_columns(F, N, J, M, system, floats, folded, new_weights, gathered, settled, work + 4, stride)
     for k in range(new_cols):
         F[new_out + k] = F[out_weights + J[OLD_COL * M + k]]
     out, new_constant = out_weights + padded(cols), new_out + padded(new_cols)
     for axis in range(4):
         F[new_constant + axis] = F[out + axis]
+    read = 0  # how many columns are of earlier levels
     for p in range(settled):
+        while read < new_cols and N[col_begin + J[OLD_COL * M + read]] <= J[SETTLED_ROW * M + p]:
+            read += 1
         w = F[out_weights + J[STABLE_COLS * M + p]]
         at = work + p * stride
-        for k in range(new_cols):
+        for k in range(read):
             F[new_out + k] += w * F[at + 4 + k]
         for axis in range(4):
             F[new_constant + axis] += w * F[at + axis]

@@ -31,6 +31,8 @@ from mn_onnx.extract.kernels.memory import (
     KIND,
     OLD_COL,
     PLACE,
+    SETTLED_ROW,
+    STABLE_COLS,
     STATE_HIGH,
     STATE_LOW,
     SYS_COLS,
@@ -42,7 +44,6 @@ from mn_onnx.extract.kernels.memory import (
     SYS_ROWS,
     SYS_SINGLE,
     SYS_UNITS,
-    UNSTABLE,
     padded,
     system_floats,
     system_ints,
@@ -130,14 +131,16 @@ def new_row(J, M, r):
 
 
 @njit(cache=True, error_model="numpy")
-def lay_out_folded(N, J, M, system, folded, least):
+def lay_out_folded(N, J, M, system, folded, least, settled):
     """Write the integer part of the system that keeps the rows of kind ``least`` or more, at ``folded``.
 
-    J[OLD_COL] gives the old column of every new one. Returns the new numbers of rows and columns.
+    J[OLD_COL] gives the old column of every new one. ``settled`` is the number of columns that are substituted, see
+    `list_settled_columns`. Returns the new numbers of rows and columns.
     """
     rows, levels = N[system + SYS_ROWS], N[system + SYS_LEVELS]
     row_col = system + SYS_HEADER + levels + 1 + rows
-    old_col_end = row_col + rows + 1 + 2 * N[system + SYS_COLS]
+    old_begin = row_col + rows + 1 + N[system + SYS_COLS]
+    old_end = old_begin + N[system + SYS_COLS]
     new_rows = choose_rows(N, J, M, system, folded, least)
     new_level_start = folded + SYS_HEADER
     new_unit = new_level_start + N[folded + SYS_LEVELS] + 1
@@ -157,15 +160,30 @@ def lay_out_folded(N, J, M, system, folded, least):
         first, last = N[new_row_col + N[new_level_start + level]], N[new_row_col + level_end]
         for c in range(first, last, 8):
             store(N, col_begin + c, splat_integer(level_end))
-    # Substitution fills the columns.
-    for c in range(0, new_cols, 8):
-        store(N, col_end + c, splat_integer(new_rows))
-    if least < UNSTABLE:
-        for c in range(new_cols):
-            end = N[old_col_end + J[OLD_COL * M + c]]
-            if end < rows:
-                N[col_end + c] = max(padded(new_row(J, M, end)), N[col_begin + c])
+    begin = end = reach = np.int64(-1)
+    for c in range(new_cols):
+        old = J[OLD_COL * M + c]
+        if N[old_begin + old] != begin or N[old_end + old] != end:
+            begin, end = N[old_begin + old], N[old_end + old]
+            reach = substituted_reach(N, J, M, old_end, begin, end, settled)
+            if reach < rows:
+                reach = max(padded(new_row(J, M, reach)), N[col_begin + c])
+            else:
+                reach = new_rows
+        N[col_end + c] = reach
     return new_rows, new_cols
+
+
+@njit(cache=True, error_model="numpy")
+def substituted_reach(N, J, M, old_end, begin, end, settled):
+    """Up to which old row a column that rows ``begin : end`` read is read once settled rows are substituted."""
+    for p in range(settled):
+        row = J[SETTLED_ROW * M + p]
+        if row >= end:
+            break
+        if row >= begin:
+            end = max(end, N[old_end + J[STABLE_COLS * M + p]])
+    return end
 
 
 @njit(cache=True, error_model="numpy")

@@ -52,7 +52,8 @@ TAGS_A, TAGS_B = np.int64(8), np.int64(9)  # kernels are called with them
 (READ_COLS, READ_AT, KIND, BELOW, ABOVE, SIDE_COUNTS) = (16, 17, 18, 19, 20, 21)
 (LEVEL_OUTPUT, LEVEL_SYMBOL, READ_ROW) = (22, 23, 24)
 (KEPT, PLACE, OLD_COL, SETTLED_ROW, COL_KIND) = (25, 26, 27, 28, 29)
-J_REGIONS = 30
+SINCE, UNTIL = np.int64(30), np.int64(31)
+J_REGIONS = 32
 
 # What F has for every row of a system, apart from the weights: the affine part, and the two pieces around its knot.
 PIECE_FLOATS = 5
