@@ -42,7 +42,7 @@ Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
 LEAF_CHOICES = 8
-# Deep cells with this share of the network's units left are bounded at some depths only: one in so many.
+# Cells with one in so many of the network's units left are large: see `how_to_bound` and LEAST_SETTLED.
 UNBOUNDED_SHARE = 4
 BUDGET = 4_000_000  # weights read between two looks at the world: some milliseconds
 BUFFER_CORNERS = 1 << 18

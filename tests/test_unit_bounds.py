@@ -47,7 +47,7 @@ def _bound(F: Any, N: Any, X: Any, J: Any, tables: Any, cell: int, scratch: int,
         J[STATE_LOW * M + r] = N[cell + CELL_HEADER + r]
         J[STATE_HIGH * M + r] = N[cell + CELL_HEADER + rows + r]
     bound_units(
-        pointer(F), pointer(N), pointer(X), pointer(J), M, point_at_tables(tables), cell, 0, 0, scratch, tracked
+        pointer(F), pointer(N), pointer(X), pointer(J), M, point_at_tables(tables), cell, 0, 0, scratch, tracked, False
     )
 
 

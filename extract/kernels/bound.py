@@ -34,9 +34,11 @@ from mn_onnx.extract.kernels.memory import (
     CELL_FLOATS,
     CELL_VERTICES,
     CENTRE_AT,
+    COL_KIND,
     ERROR,
     GROWTH,
     HIGH,
+    KIND,
     LEVEL_OUTPUT,
     LEVEL_SYMBOL,
     LOW,
@@ -52,12 +54,17 @@ from mn_onnx.extract.kernels.memory import (
     SYS_LEVELS,
     SYS_ROWS,
     SYS_SINGLE,
+    UNSTABLE,
     aligned,
     padded,
     symbol_stride,
     weights_of,
 )
 from mn_onnx.extract.kernels.settle import AGAIN, FIRST, settle_rows
+
+# Large cells are bounded no further than a level of whose units less than one in so many settles: of later levels
+# still fewer do, and the output could be anything.
+LEAST_SETTLED = 4
 
 
 @njit(cache=True, error_model="numpy")
@@ -167,12 +174,32 @@ def read_outputs_lanes(like, F, X, J, M, floats, rows, r, first, count):
 
 
 @njit(cache=True, error_model="numpy")
-def bound_units(F, N, X, J, M, tables, cell, system, floats, scratch, tracked):
+def count_units(N, row_unit, begin, end):
+    """How many of the rows are units, and not padding."""
+    count = 0
+    for r in range(begin, end):
+        count += N[row_unit + r] >= 0
+    return count
+
+
+@njit(cache=True, error_model="numpy")
+def leave_unbounded(N, X, J, M, row_col, rows, begin):
+    """Rows from ``begin`` on keep their states, and may be anything."""
+    for r in range(begin, rows):
+        X[RADIUS * M + r] = np.inf
+        J[KIND * M + r] = UNSTABLE
+    for c in range(N[row_col + begin], N[row_col + rows]):
+        J[COL_KIND * M + c] = UNSTABLE
+
+
+@njit(cache=True, error_model="numpy")
+def bound_units(F, N, X, J, M, tables, cell, system, floats, scratch, tracked, large):
     """Forward pass: bounds, states and relaxations of all rows of the system over the cell.
 
     Reads the row states in J (STATE_LOW, STATE_HIGH) and narrows them, and sets the rows' KIND. If ``tracked``, radii
     come from `error_symbols`, whose tables begin at F[scratch]. Returns the numbers of settled rows whose output is not
-    identically zero (LINEAR), and whose is (DEAD).
+    identically zero (LINEAR), and whose is (DEAD), and whether all levels are bounded: in ``large`` cells not if hardly
+    any unit of an earlier one settles.
     """
     rows, cols, levels = N[system + SYS_ROWS], N[system + SYS_COLS], N[system + SYS_LEVELS]
     level_start = system + SYS_HEADER
@@ -207,9 +234,14 @@ def bound_units(F, N, X, J, M, tables, cell, system, floats, scratch, tracked):
         )
         linear += new_linear
         dead += new_dead
+        if large and level + 1 < levels:
+            settled = new_linear + new_dead
+            if LEAST_SETTLED * settled < count_units(N, row_unit, begin, end):
+                leave_unbounded(N, X, J, M, row_col, rows, end)
+                return linear, dead, False
         if tracked:
             tracked = pass_errors_on(F, X, J, M, level, before, count, errors, carried, stride)
-    return linear, dead
+    return linear, dead, True
 
 
 @njit(cache=True, error_model="numpy")
@@ -221,10 +253,11 @@ def bound_first_level(F, N, X, J, M, tables, cell, system, floats):
     end = N[level_start + 1]
     zero = np.int64(0)
     read_outputs(F, X, J, M, floats, rows, zero, end, zero, zero)
-    for r in range(rows):
-        X[RADIUS * M + r] = 0.0 if r < end else np.inf
+    for r in range(end):
+        X[RADIUS * M + r] = 0.0
     row_extremes(F, N, X, M, cell, zero, end)
     settle_rows(F, N, X, J, M, tables, row_unit, row_unit + rows, floats, rows, zero, end, FIRST, zero)
+    leave_unbounded(N, X, J, M, row_unit + rows, rows, end)
 
 
 @njit(cache=True, error_model="numpy")

@@ -2,7 +2,8 @@
 
 A cell is bounded, dropped if the output cannot reach the level there, trimmed to where it can, folded when enough of
 its units have settled, and split along a knot of a unit whose pre-activation is already affine on it; small cells are
-emitted whole (`leaf`). In deep networks large cells are only split, at most depths: see `how_to_bound`.
+emitted whole (`leaf`). Large cells are bounded no further than it seems worth it (LEAST_SETTLED), and in deep networks
+only at some depths (`how_to_bound`); then they are only split.
 `march` returns to its caller, with the worker's state intact, when a budget of work is used up, when an arena or an
 output buffer might not have room for the next cell, or when it is told to stop.
 """
@@ -216,21 +217,22 @@ def visit(F, N, X, J, M, control, stack, output, tables, slot_of_tag, cell):
         if row >= 0:
             split_cell(F, N, X, J, M, control, stack, tables, slot_of_tag, cell, rows, system, floats, row, row, knot)
             return
-    tracked = how != SUMMED
-    linear, dead = bound_units(F, N, X, J, M, tables, cell, system, floats, control[TOP_F], tracked)
-    radius = bound_output(F, N, X, M, system, floats)
-    at = CENTRE_AT * M
-    evaluate_affine(F, N, X, M, cell, OUT_VALUES, X[at], X[at + 1], X[at + 2], X[at + 3])
-    low, high = value_range(X, M, OUT_VALUES, N[cell + CELL_CAPACITY])
-    size = abs(X[at]) + abs(X[at + 1]) + abs(X[at + 2]) + abs(X[at + 3]) + radius
-    slack = radius + MARGIN * size * tables.extent
-    if low > slack or high < -slack:
-        control[PRUNED] += 1
-        return
+    tracked, large = how != SUMMED, N[system + SYS_UNITS] >= control[UNBOUNDED_UNITS]
+    linear, dead, bounded = bound_units(F, N, X, J, M, tables, cell, system, floats, control[TOP_F], tracked, large)
     leaf = is_leaf(N, J, M, control, system)
     whole = cell
-    if not leaf:
-        cell = trim_cell(F, N, X, J, M, control, tables, slot_of_tag, cell, rows, low, high, slack)
+    if bounded:
+        radius = bound_output(F, N, X, M, system, floats)
+        at = CENTRE_AT * M
+        evaluate_affine(F, N, X, M, cell, OUT_VALUES, X[at], X[at + 1], X[at + 2], X[at + 3])
+        low, high = value_range(X, M, OUT_VALUES, N[cell + CELL_CAPACITY])
+        size = abs(X[at]) + abs(X[at + 1]) + abs(X[at + 2]) + abs(X[at + 3]) + radius
+        slack = radius + MARGIN * size * tables.extent
+        if low > slack or high < -slack:
+            control[PRUNED] += 1
+            return
+        if not leaf:
+            cell = trim_cell(F, N, X, J, M, control, tables, slot_of_tag, cell, rows, low, high, slack)
     if cell != whole:
         control[TRIMMED] += 1
         newly_linear, newly_dead = settle_again(F, N, X, J, M, tables, cell, system, floats)
