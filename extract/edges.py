@@ -13,6 +13,7 @@ from mn_onnx.extract.blocks import BLOCK_SIZE, Indices, block_count, group_items
 
 _MAX_PARTITIONS = 1 << 16  # their numbers fit in uint16
 _CORNERS_PER_PARTITION = 1 << 13  # whose counters fit in the cache of a core
+_FINE_BLOCK = 1 << 12  # of polygons or vertices; with larger ones a small mesh has too few for all threads
 
 
 def half_edge_heads(offsets: NDArray[np.int64], corners: Indices) -> Indices:
@@ -171,16 +172,16 @@ def pair_half_edges(offsets: NDArray[np.int64], corners: Indices, n_vertices: in
     order, starts = corners_by_vertex(corners, n_vertices, threads)
     heads, preceding = np.empty_like(corners), np.empty_like(twins)
     run_blocks(
-        lambda first, last: _link_corners(offsets, corners, BLOCK_SIZE, first, last, heads, preceding, twins),
-        block_count(offsets.size - 1),
+        lambda first, last: _link_corners(offsets, corners, _FINE_BLOCK, first, last, heads, preceding, twins),
+        -(-(offsets.size - 1) // _FINE_BLOCK),
         threads,
     )
     widest = int(np.diff(offsets).max())
     run_blocks(
         lambda first, last: _match_at_vertices(
-            offsets, corners, heads, preceding, order, starts, widest, BLOCK_SIZE, first, last, twins
+            offsets, corners, heads, preceding, order, starts, widest, _FINE_BLOCK, first, last, twins
         ),
-        block_count(n_vertices),
+        -(-n_vertices // _FINE_BLOCK),
         threads,
     )
     return twins

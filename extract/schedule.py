@@ -44,7 +44,7 @@ Integers = NDArray[np.int64]
 LEAF_CHOICES = 8
 # Cells with one in so many of the network's units left are large: see `how_to_bound` and LEAST_SETTLED.
 UNBOUNDED_SHARE = 4
-BUDGET = 4_000_000  # weights read between two looks at the world: some milliseconds
+BUDGET = 8_000_000  # work between two looks at the world, in weights: one or two milliseconds
 BUFFER_CORNERS = 1 << 18
 
 
@@ -216,15 +216,14 @@ class _Pool:
     def __init__(self, first: _Task, workers: int) -> None:
         self.condition = threading.Condition()
         self.waiting = [first]
-        self.idle = 0
-        self.workers = workers
+        self.idle = self.workers = workers
         self.subtrees = 1
         self.error: BaseException | None = None
         self.finished = False
 
     def take(self) -> _Task | None:
+        """A task for an idle worker, which is busy from then on; None if there is nothing left to wait for."""
         with self.condition:
-            self.idle += 1
             while not self.waiting:
                 if self.finished or self.error is not None or self.idle == self.workers:
                     self.finished = True
@@ -233,6 +232,11 @@ class _Pool:
                 self.condition.wait()
             self.idle -= 1
             return self.waiting.pop()
+
+    def finish(self) -> None:
+        """A worker is done with its task."""
+        with self.condition:
+            self.idle += 1
 
     def wants_more(self) -> bool:
         return self.idle > len(self.waiting)
@@ -283,6 +287,7 @@ def traverse(
                 while not worker.run(task, BUDGET if not pool.wants_more() else BUDGET // 20):
                     if pool.wants_more() and (given := worker.give_away()) is not None:
                         pool.put(task, given)
+                pool.finish()
         except BaseException as error:  # noqa: BLE001 - whatever it is, the caller gets it
             pool.fail(error)
 

@@ -84,6 +84,8 @@ SMALL_SYSTEM = 64
 # bound costs twice as much and settles twice as many units. Between them, systems of control[UNBOUNDED_UNITS] are not
 # bounded: what summed radii settle there is not worth reading the weights.
 TRACKED_LEVELS, TRACKED_UNITS, TRACKED_DEPTHS = 5, 24, 3
+# What a cell takes besides its weights, in weights.
+CELL_WORK = 8000
 # How the units of a cell are bounded.
 SUMMED, TRACKED, FIRST_LEVEL = 0, 1, 2
 
@@ -272,7 +274,7 @@ def march(worker, tables, output, budget):
     """Visit cells until the worker's stack is empty; returns one of the status codes of this module.
 
     ``worker``: `WorkerArrays`; ``tables``: `Tables`; ``output``: `OutputArrays`; ``budget``: about
-    how many weights to read before returning BUDGET_USED.
+    how many weights to read, or work that takes as long, before returning BUDGET_USED.
     """
     M = worker.X.size // X_REGIONS
     F, N, X, J = pointer(worker.F), pointer(worker.N), pointer(worker.X), pointer(worker.J)
@@ -296,7 +298,7 @@ def march(worker, tables, output, budget):
         control[STACK_TOP] -= 1
         control[NODES] += 1
         control[DEEPEST] = max(control[DEEPEST], N[cell + CELL_DEPTH])
-        used += 200 + rows * cols
+        used += CELL_WORK + rows * cols
         before = cycles()
         visit(F, N, X, J, M, control, stack, buffers, knots, slot_of_tag, cell)
         bin_ = 0
