@@ -82,6 +82,11 @@ class _Chunk:
     keys: Integers
     box_faces: NDArray[np.int8]
 
+    def copy(self) -> _Chunk:
+        return _Chunk(
+            self.sizes.copy(), self.gradients.copy(), self.positions.copy(), self.keys.copy(), self.box_faces.copy()
+        )
+
 
 @dataclass
 class _Task:
@@ -152,22 +157,26 @@ class _Worker:
             self.N = grown_i
 
     def flush(self, task: _Task) -> None:
-        """Move the polygons in the buffers to the task."""
+        """Move the polygons in the buffers to the task: the buffers themselves if they are at least half full."""
         polygons, corners = (int(count) for count in self.output.counts)
-        if polygons:
-            out = self.output
-            task.chunks.append(
-                _Chunk(
-                    out.sizes[:polygons].copy(),
-                    out.gradients[:polygons].copy(),
-                    out.positions[:corners].copy(),
-                    out.keys[:corners].copy(),
-                    out.box_faces[:corners].copy(),
-                )
-            )
-            self.polygons += polygons
-            self.corners += corners
+        if not polygons:
+            return
+        out = self.output
+        chunk = _Chunk(
+            out.sizes[:polygons],
+            out.gradients[:polygons],
+            out.positions[:corners],
+            out.keys[:corners],
+            out.box_faces[:corners],
+        )
+        if 2 * corners < out.box_faces.size:
+            task.chunks.append(chunk.copy())
             out.counts[:] = 0
+        else:
+            task.chunks.append(chunk)
+            self._set_output(out.sizes.size, out.box_faces.size)
+        self.polygons += polygons
+        self.corners += corners
 
     def run(self, task: _Task, budget: int) -> bool:
         """Work on the task for about ``budget``; True when it is finished or the worker was told to stop."""
