@@ -152,14 +152,17 @@ def _pack_system(network: Network, order: Integers) -> tuple[Floats, Integers]:
     pieces = np.zeros((PIECE_FLOATS, rows))
     pieces[0] = np.inf
     weights = np.zeros((cols, rows))
-    for g, unit in enumerate(network.units):
-        r = row_of_unit[g]
-        inside = unit.row.columns < network.input_dim
-        affine[unit.row.columns[inside], r] = unit.row.weights[inside]
-        affine[3, r] = unit.row.bias
-        if unit.table is not None:
-            pieces[:, r] = _two_pieces(unit.table)
-        weights[col_of_variable[unit.row.columns[~inside]], r] = unit.row.weights[~inside]
+    if network.units:
+        affine[3, row_of_unit] = [unit.row.bias for unit in network.units]
+        pieces[:, row_of_unit] = np.transpose(
+            [_two_pieces(unit.table) for unit in network.units if unit.table is not None]
+        )
+        read = np.concatenate([unit.row.columns for unit in network.units])
+        weight = np.concatenate([unit.row.weights for unit in network.units])
+        row = np.repeat(row_of_unit, [unit.row.columns.size for unit in network.units])
+        inside = read < network.input_dim
+        affine[read[inside], row[inside]] = weight[inside]
+        weights[col_of_variable[read[~inside]], row[~inside]] = weight[~inside]
     out_weights = np.zeros(padded(cols))
     out_affine = np.zeros(4)
     inside = network.output.columns < network.input_dim
