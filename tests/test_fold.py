@@ -100,11 +100,27 @@ def _with_skips(layers: list[int], seed: int) -> Network:
     return Network(3, tuple(units), network.output)
 
 
+def _sparse(layers: list[int], seed: int, reads: int = 3) -> Network:
+    """Every unit reads a few outputs of its layer before, and of all earlier ones: columns end within levels."""
+    random = np.random.default_rng(seed)
+    network = dense(layers, seed=seed)
+    starts = np.cumsum([3, *layers])
+    units = list(network.units)
+    for layer in range(1, len(layers)):
+        for g in range(starts[layer] - 3, starts[layer + 1] - 3):
+            own = random.integers(starts[layer - 1], starts[layer], 1)
+            columns = np.union1d(own, random.integers(0, starts[layer], reads))
+            row = AffineRow(columns, random.normal(size=columns.size), units[g].row.bias)
+            units[g] = replace(units[g], row=row)
+    return Network(3, tuple(units), network.output)
+
+
 NETWORKS: dict[str, Any] = {
     "one level": lambda: dense([40], seed=1),
     "three levels": lambda: dense([24, 24, 24], seed=2),
     "seven levels": lambda: dense([20, 33, 17, 40, 12, 25, 30], seed=3),
     "skips": lambda: _with_skips([24, 20, 16, 24, 20, 24, 18], seed=4),
+    "sparse": lambda: _sparse([22, 19, 26, 21, 30, 17, 23], seed=7),
     "tables": lambda: random_tables(3, (6, 6, 5, 6, 4), n_knots=4, n_outputs=3),
 }
 
@@ -124,6 +140,18 @@ def test_folded_systems_are_the_same_function(name: str, least: int, large: bool
     left_out = linear + dead if least == UNSTABLE else dead
     assert left_out > 0 or (name, least) == ("tables", LINEAR)
     assert N[memory.SYS_UNITS] == packed.N[memory.SYS_UNITS] - left_out
+    np.testing.assert_allclose(_values(F, N, units, points), expected, rtol=1e-12, atol=1e-12)
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_columns_that_end_within_levels_are_substituted(seed: int) -> None:
+    lower, upper = np.full(3, -0.3), np.full(3, 0.3)
+    network = canonicalize(_sparse([52, 49, 56, 51, 38], seed, reads=1), lower=lower, upper=upper).network
+    units = [network.units[int(g)] for g in np.argsort(network.unit_level, kind="stable")]
+    F, N, (linear, _, _) = _fold(network, UNSTABLE, False, lower, upper)
+    assert linear > 0
+    points = np.random.default_rng(5).uniform(lower, upper, (200, 3))
+    expected = naive_values(network, points, tables=True)
     np.testing.assert_allclose(_values(F, N, units, points), expected, rtol=1e-12, atol=1e-12)
 
 

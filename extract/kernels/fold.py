@@ -230,13 +230,13 @@ def fold(F, N, X, J, M, system, floats, folded, folded_floats, least):
         old_end = max(old_end, N[col_end + c])
         while end < new_rows and J[KEPT_ROWS * M + end] < old_end:
             end += 1
-        end = min(padded(end), new_rows)
         gather_column(F, J, M, weights + c * rows, N[col_begin + c], old_end, gathered + p * new_rows)
         for q in range(max(begin - TILE, 0), begin, 4):
             store(F, gathered + p * new_rows + q, splat(0.0))
-        for q in range(end, min(end + TILE, new_rows), 4):
+        until = padded(end)
+        for q in range(end, min(until + TILE, new_rows), 4):
             store(F, gathered + p * new_rows + q, splat(0.0))
-        J[SINCE * M + p], J[UNTIL * M + p] = begin, end
+        J[SINCE * M + p], J[UNTIL * M + p] = begin, until
     for k in range(ROW_FLOATS):
         gather_column(F, J, M, floats + k * rows, zero, rows, folded_floats + k * new_rows)
     accumulate(F, J, M, folded_floats, FOUR, zero, new_rows, new_rows, gathered, zero, settled, work, stride)
