@@ -38,9 +38,9 @@ def resolve_threads(threads: int | None) -> int:
     return threads
 
 
-def block_count(n_items: int) -> int:
-    """The number of blocks of `BLOCK_SIZE` that cover ``n_items``."""
-    return -(-n_items // BLOCK_SIZE)
+def block_count(n_items: int, size: int = BLOCK_SIZE) -> int:
+    """The number of blocks of ``size`` that cover ``n_items``."""
+    return -(-n_items // size)
 
 
 def run_blocks(work: Callable[[int, int], object], n_blocks: int, threads: int) -> None:

@@ -173,7 +173,7 @@ def pair_half_edges(offsets: NDArray[np.int64], corners: Indices, n_vertices: in
     heads, preceding = np.empty_like(corners), np.empty_like(twins)
     run_blocks(
         lambda first, last: _link_corners(offsets, corners, _FINE_BLOCK, first, last, heads, preceding, twins),
-        -(-(offsets.size - 1) // _FINE_BLOCK),
+        block_count(offsets.size - 1, _FINE_BLOCK),
         threads,
     )
     widest = int(np.diff(offsets).max())
@@ -181,7 +181,7 @@ def pair_half_edges(offsets: NDArray[np.int64], corners: Indices, n_vertices: in
         lambda first, last: _match_at_vertices(
             offsets, corners, heads, preceding, order, starts, widest, _FINE_BLOCK, first, last, twins
         ),
-        -(-n_vertices // _FINE_BLOCK),
+        block_count(n_vertices, _FINE_BLOCK),
         threads,
     )
     return twins

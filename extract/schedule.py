@@ -43,7 +43,7 @@ Integers = NDArray[np.int64]
 
 LEAF_CHOICES = 8
 # Cells with one in so many of the network's units left are large: see `how_to_bound` and LEAST_SETTLED.
-UNBOUNDED_SHARE = 4
+LARGE_SHARE = 4
 BUDGET = 8_000_000  # work between two looks at the world, in weights: one or two milliseconds
 BUFFER_CORNERS = 1 << 18
 
@@ -116,7 +116,7 @@ class _Worker:
         self.N = np.empty(max(1 << 16, 2 * packed.N.size), np.int64)
         self.control = np.zeros(entries.CONTROL_SIZE, np.int64)
         self.control[entries.LEAF_CHOICES] = LEAF_CHOICES
-        self.control[entries.UNBOUNDED_UNITS] = -(-int(packed.N[SYS_UNITS]) // UNBOUNDED_SHARE)
+        self.control[entries.LARGE_UNITS] = -(-int(packed.N[SYS_UNITS]) // LARGE_SHARE)
         self.stack = np.zeros(1024, np.int64)
         self.slot_of_tag = np.zeros(first_trim_tag(packed.tables.n_knots) + 2 * TRIMMED_DEPTHS, np.int64)
         self._set_scratch(max(512, -(-largest // 8) * 8))

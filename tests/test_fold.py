@@ -125,34 +125,34 @@ NETWORKS: dict[str, Any] = {
 }
 
 
+def _assert_same_function(network: Network, F: Floats, N: Integers, lower: Floats, upper: Floats) -> None:
+    units = [network.units[int(g)] for g in np.argsort(network.unit_level, kind="stable")]
+    points = np.random.default_rng(5).uniform(lower, upper, (200, 3))
+    expected = naive_values(network, points, tables=True)
+    np.testing.assert_allclose(_values(F, N, units, points), expected, rtol=1e-12, atol=1e-12)
+
+
 @pytest.mark.parametrize("least", [UNSTABLE, LINEAR], ids=["all settled", "dead only"])
 @pytest.mark.parametrize("large", [False, True], ids=["bounded", "large"])
 @pytest.mark.parametrize("name", NETWORKS)
 def test_folded_systems_are_the_same_function(name: str, least: int, large: bool) -> None:
     network = canonicalize(NETWORKS[name](), lower=LOWER, upper=UPPER).network
     packed = pack(network, LOWER, UPPER)
-    order = np.argsort(network.unit_level, kind="stable")
-    units = [network.units[int(g)] for g in order]
-    points = np.random.default_rng(5).uniform(LOWER, UPPER, (200, 3))
-    expected = naive_values(network, points, tables=True)
-    np.testing.assert_allclose(_values(packed.F, packed.N, units, points), expected, rtol=1e-12, atol=1e-12)
+    _assert_same_function(network, packed.F, packed.N, LOWER, UPPER)
     F, N, (linear, dead, _) = _fold(network, least, large)
     left_out = linear + dead if least == UNSTABLE else dead
     assert left_out > 0 or (name, least) == ("tables", LINEAR)
     assert N[memory.SYS_UNITS] == packed.N[memory.SYS_UNITS] - left_out
-    np.testing.assert_allclose(_values(F, N, units, points), expected, rtol=1e-12, atol=1e-12)
+    _assert_same_function(network, F, N, LOWER, UPPER)
 
 
 @pytest.mark.parametrize("seed", range(20))
 def test_columns_that_end_within_levels_are_substituted(seed: int) -> None:
     lower, upper = np.full(3, -0.3), np.full(3, 0.3)
     network = canonicalize(_sparse([52, 49, 56, 51, 38], seed, reads=1), lower=lower, upper=upper).network
-    units = [network.units[int(g)] for g in np.argsort(network.unit_level, kind="stable")]
     F, N, (linear, _, _) = _fold(network, UNSTABLE, False, lower, upper)
     assert linear > 0
-    points = np.random.default_rng(5).uniform(lower, upper, (200, 3))
-    expected = naive_values(network, points, tables=True)
-    np.testing.assert_allclose(_values(F, N, units, points), expected, rtol=1e-12, atol=1e-12)
+    _assert_same_function(network, F, N, lower, upper)
 
 
 def _fold_large(large: bool) -> tuple[Floats, Integers, tuple[int, int, bool]]:

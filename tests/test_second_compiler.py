@@ -48,8 +48,7 @@ def test_two_processes_compile_every_kernel_once(tmp_path: Path) -> None:
     files = [file.name for file in cache.glob("kernels_*/*.nbc")]
     assert len(files) > 50
     assert {name.split("-")[0] for name in files if not name.endswith(".1.nbc")} == {
-        "products.accumulate_lanes", "bound.read_outputs_lanes",
-        "bound.row_extremes_lanes",
+        "products.accumulate_lanes", "bound.read_outputs_lanes", "bound.row_extremes_lanes",
     }  # fmt: skip
 
 

@@ -163,7 +163,7 @@ def test_polygons_do_not_depend_on_how_often_cells_are_bounded(monkeypatch: pyte
     network = canonicalize(dense([14] * 6, seed=11), lower=lower, upper=upper).network
     results = []
     for share in (1, 1000):
-        monkeypatch.setattr(schedule, "UNBOUNDED_SHARE", share)
+        monkeypatch.setattr(schedule, "LARGE_SHARE", share)
         results.append(traverse(network, lower, upper, threads=1))
     (often, often_counts), (seldom, seldom_counts) = results
     assert seldom_counts.nodes > often_counts.nodes

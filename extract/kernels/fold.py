@@ -51,14 +51,12 @@ from mn_onnx.extract.kernels.memory import (
     system_floats,
     weights_of,
 )
-from mn_onnx.extract.kernels.products import accumulate
+from mn_onnx.extract.kernels.products import TILE, accumulate
 
 # `gather_column` writes up to so many numbers after the last one.
 OVERWRITTEN = 8
 # So many columns are written at a time; see `write_columns`.
 COLUMN_BLOCK = 8
-# The widest tile of `products`: so far beyond its numbers a source is filled with zeros.
-TILE = 16
 FOUR = np.int64(4)  # of numpy's, see `memory`
 
 
@@ -169,6 +167,34 @@ def gather_column(F, J, M, source, begin, rows, target):
 
 
 @njit(cache=True, error_model="numpy")
+def gather_settled(F, N, J, M, system, floats, settled, new_rows, gathered):
+    """What the kept rows read of every settled column, ``new_rows`` numbers each from F[gathered] on.
+
+    With J[SINCE] and J[UNTIL], and zeros before and after, for `accumulate`.
+    """
+    rows, cols = N[system + SYS_ROWS], N[system + SYS_COLS]
+    col_begin = system + SYS_HEADER + N[system + SYS_LEVELS] + 1 + 2 * rows + 1 + cols
+    col_end = col_begin + cols
+    weights = weights_of(floats, rows)
+    begin = end = old_end = np.int64(0)
+    for p in range(settled):
+        c = J[STABLE_COLS * M + p]
+        # Later rows only: a settled column is read by no row of its own level or before.
+        while begin < new_rows and J[KEPT_ROWS * M + begin] < N[col_begin + c]:
+            begin += 1
+        old_end = max(old_end, N[col_end + c])
+        while end < new_rows and J[KEPT_ROWS * M + end] < old_end:
+            end += 1
+        gather_column(F, J, M, weights + c * rows, N[col_begin + c], old_end, gathered + p * new_rows)
+        for q in range(max(begin - TILE, 0), begin, 4):
+            store(F, gathered + p * new_rows + q, splat(0.0))
+        until = padded(end)
+        for q in range(end, min(until + TILE, new_rows), 4):
+            store(F, gathered + p * new_rows + q, splat(0.0))
+        J[SINCE * M + p], J[UNTIL * M + p] = begin, until
+
+
+@njit(cache=True, error_model="numpy")
 def write_columns(F, N, J, M, system, floats, folded, weights, gathered, settled, work, stride):
     """Write the folded system's columns: the kept ones, and what the rows read of them through the settled ones.
 
@@ -178,8 +204,7 @@ def write_columns(F, N, J, M, system, floats, folded, weights, gathered, settled
     old_begin = system + SYS_HEADER + N[system + SYS_LEVELS] + 1 + 2 * old_rows + 1 + N[system + SYS_COLS]
     old_weights = weights_of(floats, old_rows)
     rows, cols = N[folded + SYS_ROWS], N[folded + SYS_COLS]
-    new_col_row = folded + SYS_HEADER + N[folded + SYS_LEVELS] + 1 + 2 * rows + 1
-    col_begin = new_col_row + cols
+    col_begin = folded + SYS_HEADER + N[folded + SYS_LEVELS] + 1 + 2 * rows + 1 + cols
     col_end = col_begin + cols
     first = k = np.int64(0)
     while k < cols:
@@ -210,7 +235,6 @@ def fold(F, N, X, J, M, system, floats, folded, folded_floats, least):
     rows, cols = N[system + SYS_ROWS], N[system + SYS_COLS]
     row_col = system + SYS_HEADER + N[system + SYS_LEVELS] + 1 + rows
     col_begin = row_col + rows + 1 + cols
-    col_end = col_begin + cols
     settled = list_settled_columns(N, X, J, M, system, least)
     new_rows, new_cols = lay_out_folded(N, J, M, system, folded, least, settled)
     stride = aligned(new_cols + 4)
@@ -221,22 +245,8 @@ def fold(F, N, X, J, M, system, floats, folded, folded_floats, least):
     out_weights = weights + cols * rows
     new_weights = weights_of(folded_floats, new_rows)
     new_out = new_weights + new_cols * new_rows
-    zero = begin = end = old_end = np.int64(0)
-    for p in range(settled):
-        c = J[STABLE_COLS * M + p]
-        # Later rows only: a settled column is read by no row of its own level or before.
-        while begin < new_rows and J[KEPT_ROWS * M + begin] < N[col_begin + c]:
-            begin += 1
-        old_end = max(old_end, N[col_end + c])
-        while end < new_rows and J[KEPT_ROWS * M + end] < old_end:
-            end += 1
-        gather_column(F, J, M, weights + c * rows, N[col_begin + c], old_end, gathered + p * new_rows)
-        for q in range(max(begin - TILE, 0), begin, 4):
-            store(F, gathered + p * new_rows + q, splat(0.0))
-        until = padded(end)
-        for q in range(end, min(until + TILE, new_rows), 4):
-            store(F, gathered + p * new_rows + q, splat(0.0))
-        J[SINCE * M + p], J[UNTIL * M + p] = begin, until
+    gather_settled(F, N, J, M, system, floats, settled, new_rows, gathered)
+    zero = np.int64(0)
     for k in range(ROW_FLOATS):
         gather_column(F, J, M, floats + k * rows, zero, rows, folded_floats + k * new_rows)
     accumulate(F, J, M, folded_floats, FOUR, zero, new_rows, new_rows, gathered, zero, settled, work, stride)

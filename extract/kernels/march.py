@@ -19,6 +19,7 @@ from mn_onnx.extract.kernels.control import (
     BROKEN_CUTS,
     DEEPEST,
     FOLDS,
+    LARGE_UNITS,
     LEAF_CHOICES,
     LEAVES,
     NEED_CORNERS,
@@ -35,7 +36,6 @@ from mn_onnx.extract.kernels.control import (
     TOP_F,
     TOP_I,
     TRIMMED,
-    UNBOUNDED_UNITS,
 )
 from mn_onnx.extract.kernels.error_symbols import tracking_floats
 from mn_onnx.extract.kernels.fold import fold, folding_floats
@@ -81,8 +81,8 @@ DONE, BUDGET_USED, ARENA_FULL, SCRATCH_FULL, OUTPUT_FULL, STACK_FULL, STOPPED = 
 # Systems of fewer units are folded freely; see `how_to_fold`.
 SMALL_SYSTEM = 64
 # In systems of so many levels and units, radii come from every unit's own error on cells of every third depth; such a
-# bound costs twice as much and settles twice as many units. Between them, systems of control[UNBOUNDED_UNITS] are not
-# bounded: what summed radii settle there is not worth reading the weights.
+# bound costs twice as much and settles twice as many units. Between them, large systems are not bounded: what summed
+# radii settle there is not worth reading the weights.
 TRACKED_LEVELS, TRACKED_UNITS, TRACKED_DEPTHS = 5, 24, 3
 # What a cell takes besides its weights, in weights.
 CELL_WORK = 8000
@@ -186,14 +186,14 @@ def how_to_fold(N, system, linear, dead):
 
 
 @njit(cache=True, error_model="numpy")
-def how_to_bound(N, control, cell, system):
+def how_to_bound(N, cell, system, large):
     """TRACKED for bounds from every unit's own error, SUMMED for sums of errors, FIRST_LEVEL for affine rows only."""
     units = N[system + SYS_UNITS]
     if N[system + SYS_LEVELS] < TRACKED_LEVELS or units < TRACKED_UNITS:
         return SUMMED
     if N[cell + CELL_DEPTH] % TRACKED_DEPTHS == 0:
         return TRACKED
-    return FIRST_LEVEL if units >= control[UNBOUNDED_UNITS] else SUMMED
+    return FIRST_LEVEL if large else SUMMED
 
 
 @njit(cache=True, error_model="numpy")
@@ -212,14 +212,15 @@ def visit(F, N, X, J, M, control, stack, output, tables, slot_of_tag, cell):
     for r in range(rows):
         J[STATE_LOW * M + r] = N[states + r]
         J[STATE_HIGH * M + r] = N[states + rows + r]
-    how = how_to_bound(N, control, cell, system)
+    large = N[system + SYS_UNITS] >= control[LARGE_UNITS]
+    how = how_to_bound(N, cell, system, large)
     if how == FIRST_LEVEL:
         bound_first_level(F, N, X, J, M, tables, cell, system, floats)
         row, knot = choose_split(N, X, J, M, tables, system)
         if row >= 0:
             split_cell(F, N, X, J, M, control, stack, tables, slot_of_tag, cell, rows, system, floats, row, row, knot)
             return
-    tracked, large = how != SUMMED, N[system + SYS_UNITS] >= control[UNBOUNDED_UNITS]
+    tracked = how != SUMMED
     linear, dead, bounded = bound_units(F, N, X, J, M, tables, cell, system, floats, control[TOP_F], tracked, large)
     leaf = is_leaf(N, J, M, control, system)
     whole = cell

@@ -7,10 +7,13 @@ from numba import njit
 from mn_onnx.extract.kernels.lanes import fma, load_like, load_wide, splat, splat_like, splat_wide, store
 from mn_onnx.extract.kernels.memory import SINCE, UNTIL
 
+# So many numbers of a column are summed in registers at a time.
+TILE = 16
+
 
 @njit(cache=True, error_model="numpy")
 def accumulate(F, J, M, target, targets, begin, end, rows, sources, first, count, coefficients, stride):
-    """To each of ``targets`` columns of ``rows`` numbers, add up those at F[sources] times coefficients.
+    """Add to each of ``targets`` columns of ``rows`` numbers the columns at F[sources] times coefficients.
 
     target t[q] += sum_p F[coefficients + p * stride + t] * source p[q], for ``begin <= q < end``, a multiple of four,
     and ``first <= p < count``. Source ``p`` is zero before J[SINCE] and from J[UNTIL] on, both ascending with p, and
@@ -22,29 +25,21 @@ def accumulate(F, J, M, target, targets, begin, end, rows, sources, first, count
     """
     q, last = begin, first
     while q < end:
-        width = 16 if q + 16 <= end else (8 if q + 8 <= end else 4)
+        width = TILE if q + TILE <= end else (8 if q + 8 <= end else 4)
         while first < count and J[UNTIL * M + first] <= q:
             first += 1
         last = max(first, last)
         while last < count and J[SINCE * M + last] < q + width:
             last += 1
         source, coefficient = sources + first * rows + q, coefficients + first * stride
-        if width == 16:
-            for t in range(0, targets, 4):
-                accumulate_tile(
-                    F, target + t * rows + q, targets - t, rows, source, last - first, coefficient + t, stride
-                )
-        else:
-            for t in range(0, targets, 4):
-                at = target + t * rows + q
-                if width == 8:
-                    accumulate_lanes(
-                        splat_wide(0.0), F, at, targets - t, rows, source, last - first, coefficient + t, stride
-                    )
-                else:
-                    accumulate_lanes(
-                        splat(0.0), F, at, targets - t, rows, source, last - first, coefficient + t, stride
-                    )
+        for t in range(0, targets, 4):
+            at, left, weight, n = target + t * rows + q, targets - t, coefficient + t, last - first
+            if width == TILE:
+                accumulate_tile(F, at, left, rows, source, n, weight, stride)
+            elif width == 8:
+                accumulate_lanes(splat_wide(0.0), F, at, left, rows, source, n, weight, stride)
+            else:
+                accumulate_lanes(splat(0.0), F, at, left, rows, source, n, weight, stride)
         q += width
 
 
