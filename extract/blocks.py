@@ -9,6 +9,7 @@ from __future__ import annotations
 import functools
 import itertools
 import os
+import sys
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor, wait
 from typing import Any
@@ -51,7 +52,9 @@ def run_blocks(work: Callable[[int, int], object], n_blocks: int, threads: int) 
     n_tasks = max(1, min(n_blocks, threads * _TASKS_PER_THREAD))
     limits = [n_blocks * task // n_tasks for task in range(n_tasks + 1)]
     ranges = list(itertools.pairwise(limits))
-    if threads == 1 or n_tasks == 1:
+    cores = allowed_cores()
+    # On one core, as when a thread that keeps to one hands out work of its own, others would only take turns with it.
+    if threads == 1 or n_tasks == 1 or len(cores) == 1:
         for first, last in ranges:
             work(first, last)
         return
@@ -65,21 +68,47 @@ def run_blocks(work: Callable[[int, int], object], n_blocks: int, threads: int) 
             list(waiting)  # nothing is left for the other threads
             raise
 
-    helpers = [_helpers(threads - 1).submit(work_on) for _ in range(min(threads, n_tasks) - 1)]
+    helpers = [_helpers(threads - 1, cores).submit(work_on) for _ in range(min(threads, n_tasks) - 1)]
+    keep_to_core(cores, 0, threads)
     try:
         work_on()
     finally:
         # A helper that has not begun is not needed: all ranges are taken.
         begun = [helper for helper in helpers if not helper.cancel()]
         wait(begun)
+        allow_cores(cores)
     for helper in begun:
         helper.result()
 
 
 @functools.cache
-def _helpers(count: int) -> ThreadPoolExecutor:
+def _helpers(count: int, cores: tuple[int, ...]) -> ThreadPoolExecutor:
     """Threads that wait for work: starting new ones for every call would take longer than many calls' work."""
-    return ThreadPoolExecutor(count, thread_name_prefix="blocks")
+    numbers = itertools.count(1)
+    return ThreadPoolExecutor(
+        count, thread_name_prefix="blocks", initializer=lambda: keep_to_core(cores, next(numbers), count + 1)
+    )
+
+
+def allowed_cores() -> tuple[int, ...]:
+    """The cores that the calling thread may run on; empty where the system does not tell."""
+    return tuple(sorted(os.sched_getaffinity(0))) if sys.platform == "linux" else ()
+
+
+def allow_cores(cores: tuple[int, ...]) -> None:
+    """Let the calling thread run on these cores; does nothing if there are none."""
+    if sys.platform == "linux" and cores:
+        os.sched_setaffinity(0, cores)
+
+
+def keep_to_core(cores: tuple[int, ...], number: int, threads: int) -> None:
+    """Keep the calling thread, number so many of ``threads``, to a core of its own if the threads take all ``cores``.
+
+    A scheduler may wake a thread on the core of the one that woke it, where they take turns for milliseconds while
+    another core is idle. Measured: welding on two cores 29 instead of 35 ms.
+    """
+    if threads == len(cores):
+        allow_cores(cores[number : number + 1])
 
 
 def run_matrix_blocks(work: Callable[[int, int], object], n_blocks: int, threads: int) -> None:

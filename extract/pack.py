@@ -154,9 +154,9 @@ def _pack_system(network: Network, order: Integers) -> tuple[Floats, Integers]:
     weights = np.zeros((cols, rows))
     if network.units:
         affine[3, row_of_unit] = [unit.row.bias for unit in network.units]
-        pieces[:, row_of_unit] = np.transpose(
-            [_two_pieces(unit.table) for unit in network.units if unit.table is not None]
-        )
+        tables = {id(unit.table): unit.table for unit in network.units if unit.table is not None}
+        pieces_of = {key: _two_pieces(table) for key, table in tables.items()}  # units of a layer share a table
+        pieces[:, row_of_unit] = np.transpose([pieces_of[id(unit.table)] for unit in network.units])
         read = np.concatenate([unit.row.columns for unit in network.units])
         weight = np.concatenate([unit.row.weights for unit in network.units])
         row = np.repeat(row_of_unit, [unit.row.columns.size for unit in network.units])

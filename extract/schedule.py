@@ -9,13 +9,14 @@ from __future__ import annotations
 
 import os
 import threading
+from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mn_onnx.extract.blocks import run_blocks
+from mn_onnx.extract.blocks import allowed_cores, block_count, keep_to_core, run_blocks
 from mn_onnx.extract.kernels import control as entries
 from mn_onnx.extract.kernels import march as kernel
 from mn_onnx.extract.kernels.memory import (
@@ -44,8 +45,10 @@ Integers = NDArray[np.int64]
 LEAF_CHOICES = 8
 # Cells with one in so many of the network's units left are large: see `how_to_bound` and LEAST_SETTLED.
 LARGE_SHARE = 4
-BUDGET = 8_000_000  # work between two looks at the world, in weights: one or two milliseconds
+# Work between two looks at the world, in weights: some ten milliseconds, and much less while a worker waits.
+BUDGET = 64_000_000
 BUFFER_CORNERS = 1 << 18
+_PART_CORNERS = 1 << 13  # of a full buffer, copied by one thread at a time
 
 
 @dataclass
@@ -222,10 +225,11 @@ class _Worker:
 class _Pool:
     """Tasks waiting, workers idle, and the first error or interrupt."""
 
-    def __init__(self, first: _Task, workers: int) -> None:
+    def __init__(self, first: _Task, workers: list[_Worker]) -> None:
         self.condition = threading.Condition()
         self.waiting = [first]
-        self.idle = self.workers = workers
+        self.workers = workers
+        self.idle = len(workers)
         self.subtrees = 1
         self.error: BaseException | None = None
         self.finished = False
@@ -234,10 +238,12 @@ class _Pool:
         """A task for an idle worker, which is busy from then on; None if there is nothing left to wait for."""
         with self.condition:
             while not self.waiting:
-                if self.finished or self.error is not None or self.idle == self.workers:
+                if self.finished or self.error is not None or self.idle == len(self.workers):
                     self.finished = True
                     self.condition.notify_all()
                     return None
+                for worker in self.workers:
+                    worker.control[entries.ASKED] = 1
                 self.condition.wait()
             self.idle -= 1
             return self.waiting.pop()
@@ -286,14 +292,18 @@ def traverse(
     if count < 1:
         raise ValueError(f"threads must be at least 1, not {count}")
     first = _Task(packed.F, packed.N, packed.root)
-    pool = _Pool(first, count)
     workers = [_Worker(packed) for _ in range(count)]
+    pool = _Pool(first, workers)
 
-    def work(worker: _Worker) -> None:
+    cores = allowed_cores()
+
+    def work(number: int) -> None:
+        worker = workers[number]
         try:
+            keep_to_core(cores, number, count)
             while (task := pool.take()) is not None:
                 worker.start(task)
-                while not worker.run(task, BUDGET if not pool.wants_more() else BUDGET // 20):
+                while not worker.run(task, BUDGET if not pool.wants_more() else BUDGET // 160):
                     if pool.wants_more() and (given := worker.give_away()) is not None:
                         pool.put(task, given)
                 pool.finish()
@@ -307,7 +317,7 @@ def traverse(
             corners = sum(worker.corners + int(worker.output.counts[1]) for worker in workers)
             progress(Progress(nodes, polygons, corners))
 
-    crew = [threading.Thread(target=work, args=(worker,), daemon=True) for worker in workers]
+    crew = [threading.Thread(target=work, args=(number,), daemon=True) for number in range(count)]
     for thread in crew:
         thread.start()
     try:
@@ -347,7 +357,7 @@ def _statistics(workers: list[_Worker], pool: _Pool) -> TraversalStatistics:
 
 def _collect(first: _Task, threads: int) -> PolygonSoup:
     """The polygons of all tasks, taken out of them."""
-    chunks: list[_Chunk] = []
+    chunks: deque[_Chunk] = deque()
     task: _Task | None = first
     while task is not None:
         chunks.extend(task.chunks)
@@ -355,32 +365,42 @@ def _collect(first: _Task, threads: int) -> PolygonSoup:
         task = task.following
     polygons = sum(chunk.sizes.size for chunk in chunks)
     corners = sum(chunk.box_faces.size for chunk in chunks)
-    offsets = np.zeros(polygons + 1, np.int64)
     soup = PolygonSoup(
-        offsets,
+        np.zeros(polygons + 1, np.int64),
         np.empty((corners, 3)),
         np.empty((corners, 2), np.uint64),
         np.empty(corners, np.int8),
         np.empty((polygons, 3)),
         np.zeros(polygons),
     )
-    first_polygons = np.cumsum([0, *(chunk.sizes.size for chunk in chunks)])
-    first_corners = np.cumsum([0, *(chunk.box_faces.size for chunk in chunks)])
-
-    # Chunks are released one by one, so that the soup and they are never held twice.
-    left = dict(enumerate(chunks))
-    del chunks
-
-    def place(begin: int, end: int) -> None:
-        for number in range(begin, end):
-            chunk, p, c = left.pop(number), first_polygons[number], first_corners[number]
-            q, d = first_polygons[number + 1], first_corners[number + 1]
-            np.cumsum(chunk.sizes, out=offsets[p + 1 : q + 1])
-            offsets[p + 1 : q + 1] += c
-            soup.gradients[p:q] = chunk.gradients
-            soup.positions[c:d] = chunk.positions
-            soup.keys[c:d] = chunk.keys.view(np.uint64)
-            soup.box_faces[c:d] = chunk.box_faces
-
-    run_blocks(place, len(left), threads)
+    polygon = corner = 0
+    while chunks:
+        # Chunks are released one by one, so that the soup and they are never held twice.
+        chunk = chunks.popleft()
+        _place_chunk(chunk, soup, polygon, corner, threads)
+        polygon += chunk.sizes.size
+        corner += chunk.box_faces.size
     return soup
+
+
+def _place_chunk(chunk: _Chunk, soup: PolygonSoup, polygon: int, corner: int, threads: int) -> None:
+    """Copy a chunk into the soup, from a polygon and its first corner on.
+
+    In small parts: what takes the time is the first use of the soup's memory.
+    """
+    polygons, corners = chunk.sizes.size, chunk.box_faces.size
+    ends = soup.offsets[polygon + 1 : polygon + polygons + 1]
+    np.cumsum(chunk.sizes, out=ends)
+    ends += corner
+    parts = min(threads, block_count(corners, _PART_CORNERS))
+
+    def place(first: int, last: int) -> None:
+        begin, end = polygons * first // parts, polygons * last // parts
+        soup.gradients[polygon + begin : polygon + end] = chunk.gradients[begin:end]
+        begin, end = corners * first // parts, corners * last // parts
+        target = slice(corner + begin, corner + end)
+        soup.positions[target] = chunk.positions[begin:end]
+        soup.keys[target] = chunk.keys[begin:end].view(np.uint64)
+        soup.box_faces[target] = chunk.box_faces[begin:end]
+
+    run_blocks(place, parts, threads)

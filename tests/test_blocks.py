@@ -7,7 +7,15 @@ import time
 import numpy as np
 import pytest
 
-from mn_onnx.extract.blocks import BLOCK_SIZE, block_count, group_items, index_dtype, resolve_threads, run_blocks
+from mn_onnx.extract.blocks import (
+    BLOCK_SIZE,
+    allowed_cores,
+    block_count,
+    group_items,
+    index_dtype,
+    resolve_threads,
+    run_blocks,
+)
 
 
 @pytest.mark.parametrize("threads", [1, 2, 7])
@@ -51,6 +59,43 @@ def test_work_may_hand_out_work_of_its_own() -> None:
 
     run_blocks(row, 6, 2)
     assert (done == 1).all()
+
+
+needs_two_cores = pytest.mark.skipif(len(allowed_cores()) < 2, reason="needs two cores, and a system that names them")
+
+
+@needs_two_cores
+def test_threads_that_take_all_cores_have_one_each() -> None:
+    cores = allowed_cores()
+    seen = []
+
+    def work(first: int, last: int) -> None:
+        time.sleep(0.02)
+        seen.append(allowed_cores())
+
+    run_blocks(work, 4 * len(cores), len(cores))
+    assert set(seen) == {(core,) for core in cores}
+    assert allowed_cores() == cores
+
+
+@needs_two_cores
+def test_the_caller_may_run_anywhere_again_after_an_error() -> None:
+    cores = allowed_cores()
+
+    def work(first: int, last: int) -> None:
+        raise RuntimeError("no room")
+
+    with pytest.raises(RuntimeError, match="no room"):
+        run_blocks(work, 8, len(cores))
+    assert allowed_cores() == cores
+
+
+@needs_two_cores
+def test_other_numbers_of_threads_leave_it_to_the_system() -> None:
+    cores = allowed_cores()
+    seen = []
+    run_blocks(lambda first, last: seen.append(allowed_cores()), 8, len(cores) + 1)
+    assert set(seen) == {cores}
 
 
 @pytest.mark.parametrize("n_items", [0, 1, 1000, 3 * BLOCK_SIZE + 17])

@@ -11,6 +11,8 @@ from scipy.spatial import KDTree
 
 from mn_onnx.extract import schedule
 from mn_onnx.extract.invariants import Invariants, check_invariants
+from mn_onnx.extract.kernels import control as entries
+from mn_onnx.extract.pack import pack
 from mn_onnx.extract.schedule import traverse
 from mn_onnx.extract.soup import PolygonSoup
 from mn_onnx.extract.weld import weld
@@ -151,3 +153,16 @@ def test_further_units_split_polygons_and_keep_the_surface() -> None:
     assert fine.n_polygons > coarse.n_polygons
     assert fine.area == pytest.approx(coarse.area, rel=1e-12)
     assert check_invariants(fine).euler == check_invariants(coarse).euler
+
+
+def test_a_worker_asked_for_work_returns_at_once_and_loses_nothing() -> None:
+    packed = pack(NETWORKS["relu"], LOWER, UPPER)
+    worker, task = schedule._Worker(packed), schedule._Task(packed.F, packed.N, packed.root)
+    worker.start(task)
+    assert not worker.run(task, 100_000)
+    visited = worker.control[entries.NODES]
+    worker.control[entries.ASKED] = 1
+    assert not worker.run(task, 1 << 60)
+    assert worker.control[entries.NODES] == visited
+    assert worker.run(task, 1 << 60)
+    assert worker.polygons == len(_soup(NETWORKS["relu"]).offsets) - 1

@@ -4,8 +4,8 @@ A cell is bounded, dropped if the output cannot reach the level there, trimmed t
 its units have settled, and split along a knot of a unit whose pre-activation is already affine on it; small cells are
 emitted whole (`leaf`). Large cells are bounded no further than it seems worth it (LEAST_SETTLED), and in deep networks
 only at some depths (`how_to_bound`); then they are only split.
-`march` returns to its caller, with the worker's state intact, when a budget of work is used up, when an arena or an
-output buffer might not have room for the next cell, or when it is told to stop.
+`march` returns to its caller, with the worker's state intact, when a budget of work is used up, when it is asked for
+work to share, when an arena or an output buffer might not have room for the next cell, or when it is told to stop.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from numba import njit
 
 from mn_onnx.extract.kernels.bound import bound_first_level, bound_output, bound_units, settle_again, value_range
 from mn_onnx.extract.kernels.control import (
+    ASKED,
     BROKEN_CUTS,
     DEEPEST,
     FOLDS,
@@ -275,7 +276,7 @@ def march(worker, tables, output, budget):
     """Visit cells until the worker's stack is empty; returns one of the status codes of this module.
 
     ``worker``: `WorkerArrays`; ``tables``: `Tables`; ``output``: `OutputArrays`; ``budget``: about
-    how many weights to read, or work that takes as long, before returning BUDGET_USED.
+    how many weights to read, or work that takes as long, before returning BUDGET_USED, as it does when it is ASKED.
     """
     M = worker.X.size // X_REGIONS
     F, N, X, J = pointer(worker.F), pointer(worker.N), pointer(worker.X), pointer(worker.J)
@@ -287,7 +288,8 @@ def march(worker, tables, output, budget):
     while control[STACK_TOP] > control[STACK_BOTTOM]:
         if control[STOP] != 0:
             return STOPPED
-        if used > budget:
+        if used > budget or control[ASKED] != 0:
+            control[ASKED] = 0
             return BUDGET_USED
         cell = stack[control[STACK_TOP] - 1]
         system = N[cell + CELL_SYSTEM_I]
