@@ -22,6 +22,9 @@ from threadpoolctl import threadpool_limits
 BLOCK_SIZE = 1 << 16
 """Items per block: some hundred microseconds of work, so that handing it out costs nothing beside it."""
 
+FINE_BLOCK = 1 << 12
+"""Polygons or vertices per block: with larger ones a small mesh has too few for all threads."""
+
 _TASKS_PER_THREAD = 4
 
 Indices = NDArray[np.integer[Any]]

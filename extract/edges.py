@@ -9,11 +9,10 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from mn_onnx.extract.blocks import BLOCK_SIZE, Indices, block_count, group_items, index_dtype, run_blocks
+from mn_onnx.extract.blocks import BLOCK_SIZE, FINE_BLOCK, Indices, block_count, group_items, index_dtype, run_blocks
 
 _MAX_PARTITIONS = 1 << 16  # their numbers fit in uint16
 _CORNERS_PER_PARTITION = 1 << 13  # whose counters fit in the cache of a core
-_FINE_BLOCK = 1 << 12  # of polygons or vertices; with larger ones a small mesh has too few for all threads
 
 
 def half_edge_heads(offsets: NDArray[np.int64], corners: Indices) -> Indices:
@@ -172,16 +171,16 @@ def pair_half_edges(offsets: NDArray[np.int64], corners: Indices, n_vertices: in
     order, starts = corners_by_vertex(corners, n_vertices, threads)
     heads, preceding = np.empty_like(corners), np.empty_like(twins)
     run_blocks(
-        lambda first, last: _link_corners(offsets, corners, _FINE_BLOCK, first, last, heads, preceding, twins),
-        block_count(offsets.size - 1, _FINE_BLOCK),
+        lambda first, last: _link_corners(offsets, corners, FINE_BLOCK, first, last, heads, preceding, twins),
+        block_count(offsets.size - 1, FINE_BLOCK),
         threads,
     )
     widest = int(np.diff(offsets).max())
     run_blocks(
         lambda first, last: _match_at_vertices(
-            offsets, corners, heads, preceding, order, starts, widest, _FINE_BLOCK, first, last, twins
+            offsets, corners, heads, preceding, order, starts, widest, FINE_BLOCK, first, last, twins
         ),
-        block_count(n_vertices, _FINE_BLOCK),
+        block_count(n_vertices, FINE_BLOCK),
         threads,
     )
     return twins

@@ -9,7 +9,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from mn_onnx.extract.blocks import BLOCK_SIZE, Indices, block_count, run_blocks
+from mn_onnx.extract.blocks import FINE_BLOCK, Indices, block_count, run_blocks
 
 Floats = NDArray[np.float64]
 
@@ -107,7 +107,7 @@ def measure_polygons(vertices: Floats, offsets: NDArray[np.int64], corners: Indi
                 offsets,
                 corners,
                 centre,
-                BLOCK_SIZE,
+                FINE_BLOCK,
                 first,
                 last,
                 measures.area_vectors,
@@ -115,7 +115,7 @@ def measure_polygons(vertices: Floats, offsets: NDArray[np.int64], corners: Indi
                 measures.perimeters,
                 measures.shortest_edges,
             ),
-            block_count(n_polygons),
+            block_count(n_polygons, FINE_BLOCK),
             threads,
         )
     return measures

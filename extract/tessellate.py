@@ -6,7 +6,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from mn_onnx.extract.blocks import BLOCK_SIZE, Indices, block_count, run_blocks
+from mn_onnx.extract.blocks import FINE_BLOCK, Indices, block_count, run_blocks
 
 Floats = NDArray[np.float64]
 
@@ -16,43 +16,52 @@ def _fan(
     vertices: Floats,
     offsets: NDArray[np.int64],
     corners: Indices,
+    widest: int,
     block_size: int,
     first: int,
     last: int,
     triangles: Indices,
 ) -> None:
-    """Fans of the polygons in blocks ``first .. last``, each from the apex whose smallest triangle is largest."""
+    """Fans of the polygons in blocks ``first .. last``, each from the apex whose smallest triangle is largest.
+
+    ``widest``: the most corners that a polygon has.
+    """
+    ring = np.empty((2 * widest, 3))  # the corners twice, so that every fan is a stretch of them
+    members = np.empty(2 * widest, corners.dtype)
     for polygon in range(first * block_size, min(last * block_size, offsets.size - 1)):
         begin = offsets[polygon]
         n = offsets[polygon + 1] - begin
+        for k in range(n):
+            vertex = corners[begin + k]
+            members[k] = members[n + k] = vertex
+            for axis in range(3):
+                ring[k, axis] = ring[n + k, axis] = vertices[vertex, axis]
         best_apex, best_area = 0, -1.0
         for apex in range(n if n > 3 else 0):
             smallest = np.inf
-            a = corners[begin + apex]
-            for step in range(1, n - 1):
-                b = corners[begin + (apex + step) % n]
-                c = corners[begin + (apex + step + 1) % n]
-                ux, uy, uz = (
-                    vertices[b, 0] - vertices[a, 0],
-                    vertices[b, 1] - vertices[a, 1],
-                    vertices[b, 2] - vertices[a, 2],
-                )
+            ux, uy, uz = (
+                ring[apex + 1, 0] - ring[apex, 0],
+                ring[apex + 1, 1] - ring[apex, 1],
+                ring[apex + 1, 2] - ring[apex, 2],
+            )
+            for corner in range(apex + 2, apex + n):
                 wx, wy, wz = (
-                    vertices[c, 0] - vertices[a, 0],
-                    vertices[c, 1] - vertices[a, 1],
-                    vertices[c, 2] - vertices[a, 2],
+                    ring[corner, 0] - ring[apex, 0],
+                    ring[corner, 1] - ring[apex, 1],
+                    ring[corner, 2] - ring[apex, 2],
                 )
                 area = (uy * wz - uz * wy) ** 2 + (uz * wx - ux * wz) ** 2 + (ux * wy - uy * wx) ** 2
                 smallest = min(smallest, area)
                 if smallest <= best_area:
                     break
+                ux, uy, uz = wx, wy, wz
             if smallest > best_area:
                 best_apex, best_area = apex, smallest
         triangle = begin - 2 * polygon
-        for step in range(1, n - 1):
-            triangles[triangle, 0] = corners[begin + best_apex]
-            triangles[triangle, 1] = corners[begin + (best_apex + step) % n]
-            triangles[triangle, 2] = corners[begin + (best_apex + step + 1) % n]
+        for corner in range(best_apex + 1, best_apex + n - 1):
+            triangles[triangle, 0] = members[best_apex]
+            triangles[triangle, 1] = members[corner]
+            triangles[triangle, 2] = members[corner + 1]
             triangle += 1
 
 
@@ -65,9 +74,10 @@ def fan_triangles(vertices: Floats, offsets: NDArray[np.int64], corners: Indices
     """
     n_polygons = offsets.size - 1
     triangles = np.empty((corners.size - 2 * n_polygons, 3), corners.dtype)
+    widest = int(np.diff(offsets).max(initial=0))
     run_blocks(
-        lambda first, last: _fan(vertices, offsets, corners, BLOCK_SIZE, first, last, triangles),
-        block_count(n_polygons),
+        lambda first, last: _fan(vertices, offsets, corners, widest, FINE_BLOCK, first, last, triangles),
+        block_count(n_polygons, FINE_BLOCK),
         threads,
     )
     return triangles
