@@ -131,23 +131,32 @@ def _match_at_vertices(
     corner before. The end with fewer corners looks, so that a vertex of huge valence costs no more than its
     neighbours.
     """
-    for vertex in range(first * block_size, min(last * block_size, starts.size - 1)):
-        begin, end = starts[vertex], starts[vertex + 1]
-        for position in range(begin, end):
-            corner = order[position]
-            head = heads[corner]
-            excess = (end - begin) - (starts[head + 1] - starts[head])
+    begin_vertex, end_vertex = first * block_size, min(last * block_size, starts.size - 1)
+    largest = 0
+    for vertex in range(begin_vertex, end_vertex):
+        largest = max(largest, starts[vertex + 1] - starts[vertex])
+    # Of every corner at a vertex: where its half-edge ends, and the half-edge that ends in it and where that begins.
+    outgoing, incoming = np.empty(largest, corners.dtype), np.empty(largest, corners.dtype)
+    before = np.empty(largest, twins.dtype)
+    for vertex in range(begin_vertex, end_vertex):
+        begin, valence = starts[vertex], starts[vertex + 1] - starts[vertex]
+        for k in range(valence):
+            corner = order[begin + k]
+            before[k] = preceding[corner]
+            outgoing[k] = heads[corner]
+            incoming[k] = corners[before[k]]
+        for k in range(valence):
+            head = outgoing[k]
+            excess = valence - (starts[head + 1] - starts[head])
             if excess > 0 or (excess == 0 and vertex >= head):
                 continue
+            corner = partner = order[begin + k]
             n_outgoing = n_incoming = 0
-            partner = corner
-            for other in range(begin, end):
-                if heads[order[other]] == head:
-                    n_outgoing += 1
-                before = preceding[order[other]]
-                if corners[before] == head:
+            for other in range(valence):
+                n_outgoing += outgoing[other] == head
+                if incoming[other] == head:
                     n_incoming += 1
-                    partner = before
+                    partner = before[other]
             if n_outgoing != 1 or n_incoming != 1:
                 continue
             if abs(partner - corner) < widest:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
 
 import numba
 import numpy as np
@@ -14,10 +13,13 @@ from mn_onnx.extract.blocks import FINE_BLOCK, Indices, block_count, run_blocks
 Floats = NDArray[np.float64]
 
 
+@numba.njit(cache=True, nogil=True)
 def lengths(vectors: Floats) -> Floats:
-    """Lengths [n] of vectors [n, 3]; column by column, which is faster than sums along the short axis."""
-    x, y, z = vectors.T
-    return np.asarray(np.sqrt(x * x + y * y + z * z))
+    """Lengths [n] of vectors [n, 3]."""
+    result = np.empty(vectors.shape[0])
+    for i in range(result.size):
+        result[i] = np.sqrt(vectors[i, 0] ** 2 + vectors[i, 1] ** 2 + vectors[i, 2] ** 2)
+    return result
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,20 +27,17 @@ class PolygonMeasures:
     """What is measured on each of ``p`` polygons.
 
     ``area_vectors``: float64 [p, 3], of the length of the area and the direction of the normal that the corners'
-    order gives.
+    order gives. ``areas``: float64 [p], their lengths.
     ``volumes``: float64 [p], the signed volume of the cone from a common point; their sum over a closed component is
     the volume inside it.
     ``perimeters``, ``shortest_edges``: float64 [p].
     """
 
     area_vectors: Floats
+    areas: Floats
     volumes: Floats
     perimeters: Floats
     shortest_edges: Floats
-
-    @cached_property
-    def areas(self) -> Floats:
-        return lengths(self.area_vectors)
 
 
 @numba.njit(cache=True, nogil=True)
@@ -51,6 +50,7 @@ def _measure(
     first: int,
     last: int,
     area_vectors: Floats,
+    areas: Floats,
     volumes: Floats,
     perimeters: Floats,
     shortest_edges: Floats,
@@ -83,6 +83,7 @@ def _measure(
         area_vectors[polygon, 0] = ax
         area_vectors[polygon, 1] = ay
         area_vectors[polygon, 2] = az
+        areas[polygon] = np.sqrt(ax**2 + ay**2 + az**2)
         volumes[polygon] = (
             ax * (vertices[origin, 0] - centre[0])
             + ay * (vertices[origin, 1] - centre[1])
@@ -95,9 +96,7 @@ def _measure(
 def measure_polygons(vertices: Floats, offsets: NDArray[np.int64], corners: Indices, threads: int) -> PolygonMeasures:
     """Measure planar polygons: ``vertices`` [v, 3], ``offsets`` int64 [p + 1], ``corners`` [c] vertex indices."""
     n_polygons = offsets.size - 1
-    measures = PolygonMeasures(
-        np.empty((n_polygons, 3)), np.empty(n_polygons), np.empty(n_polygons), np.empty(n_polygons)
-    )
+    measures = PolygonMeasures(np.empty((n_polygons, 3)), *(np.empty(n_polygons) for _ in range(4)))
     if n_polygons:
         # Column by column: numpy is several times slower along the long axis of a table.
         centre = np.array([0.5 * (column.min() + column.max()) for column in vertices.T])
@@ -111,6 +110,7 @@ def measure_polygons(vertices: Floats, offsets: NDArray[np.int64], corners: Indi
                 first,
                 last,
                 measures.area_vectors,
+                measures.areas,
                 measures.volumes,
                 measures.perimeters,
                 measures.shortest_edges,

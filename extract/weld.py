@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mn_onnx.extract.blocks import (
-    BLOCK_SIZE,
+    FINE_BLOCK,
     Indices,
     block_count,
     group_items,
@@ -38,6 +38,21 @@ _GOLDEN = 0x9E3779B97F4A7C15
 
 
 @numba.njit(cache=True, nogil=True)
+def _mix(low: np.uint64, high: np.uint64) -> np.uint64:
+    """A hash of both halves of a key; its upper bits are the key's partition, lower ones its place in a table."""
+    return (low ^ (high * np.uint64(_KEY_MIX))) * np.uint64(_GOLDEN)
+
+
+@numba.njit(cache=True, nogil=True)
+def _assign_partitions(
+    keys: NDArray[np.uint64], bits: int, block_size: int, first: int, last: int, partitions: NDArray[np.uint16]
+) -> None:
+    """The partition, one of ``2 ** bits``, of the keys in blocks ``first .. last``."""
+    for corner in range(first * block_size, min(last * block_size, partitions.size)):
+        partitions[corner] = _mix(keys[corner, 0], keys[corner, 1]) >> np.uint64(64 - bits)
+
+
+@numba.njit(cache=True, nogil=True)
 def _find_first_corners(
     keys: NDArray[np.uint64], order: Indices, starts: NDArray[np.int64], first: int, last: int, first_corners: Indices
 ) -> None:
@@ -54,8 +69,7 @@ def _find_first_corners(
             gathered[item, 1] = keys[order[begin + item], 1]
         for item in range(end - begin):
             low, high = gathered[item, 0], gathered[item, 1]
-            mixed = (low ^ (high * np.uint64(_KEY_MIX))) * np.uint64(_GOLDEN)
-            slot = np.int64((mixed >> np.uint64(16)) & np.uint64(size - 1))
+            slot = np.int64((_mix(low, high) >> np.uint64(16)) & np.uint64(size - 1))
             held = table[slot]
             while held >= 0 and (gathered[held, 0] != low or gathered[held, 1] != high):
                 slot = (slot + 1) & (size - 1)
@@ -64,6 +78,16 @@ def _find_first_corners(
                 held = item
                 table[slot] = item
             first_corners[order[begin + item]] = order[begin + held]
+
+
+@numba.njit(cache=True, nogil=True)
+def _count_vertices(first_corners: Indices, block_size: int, first: int, last: int, counts: NDArray[np.int64]) -> None:
+    """The number of first corners in each of the blocks ``first .. last``, one place further on in ``counts``."""
+    for block in range(first, last):
+        count = 0
+        for corner in range(block * block_size, min((block + 1) * block_size, first_corners.size)):
+            count += first_corners[corner] == corner
+        counts[block + 1] = count
 
 
 @numba.njit(cache=True, nogil=True)
@@ -143,13 +167,11 @@ def _group_by_key(keys: NDArray[np.uint64], threads: int) -> tuple[Indices, NDAr
     bits = min(_MAX_PARTITION_BITS, max(1, (n_corners // _CORNERS_PER_PARTITION).bit_length()))
     partitions = np.empty(n_corners, np.uint16)
 
-    def assign_partitions(first: int, last: int) -> None:
-        for block in range(first, last):
-            inside = slice(block * BLOCK_SIZE, (block + 1) * BLOCK_SIZE)
-            mixed = (keys[inside, 0] ^ (keys[inside, 1] * np.uint64(_KEY_MIX))) * np.uint64(_GOLDEN)
-            partitions[inside] = mixed >> np.uint64(64 - bits)
-
-    run_blocks(assign_partitions, block_count(n_corners), threads)
+    run_blocks(
+        lambda first, last: _assign_partitions(keys, bits, FINE_BLOCK, first, last, partitions),
+        block_count(n_corners, FINE_BLOCK),
+        threads,
+    )
     return group_items(partitions, 1 << bits, threads)
 
 
@@ -168,23 +190,16 @@ def first_of_equal_keys(keys: NDArray[np.uint64], threads: int) -> Indices:
 def _weld_corners(soup: PolygonSoup, threads: int) -> tuple[Floats, Indices, int, float]:
     """Vertices, the vertex of each corner, how many corners disagree with their vertex, and by how much at most."""
     first_corners = first_of_equal_keys(soup.keys, threads)
-    n_blocks = block_count(first_corners.size)
+    n_blocks = block_count(first_corners.size, FINE_BLOCK)
     counts = np.zeros(n_blocks + 1, np.int64)
-
-    def count_vertices(first: int, last: int) -> None:
-        for block in range(first, last):
-            leaders = first_corners[block * BLOCK_SIZE : (block + 1) * BLOCK_SIZE]
-            begin = block * BLOCK_SIZE
-            counts[block + 1] = np.count_nonzero(leaders == np.arange(begin, begin + leaders.size, dtype=leaders.dtype))
-
-    run_blocks(count_vertices, n_blocks, threads)
+    run_blocks(lambda first, last: _count_vertices(first_corners, FINE_BLOCK, first, last, counts), n_blocks, threads)
     first_vertices = np.cumsum(counts)
     n_vertices = int(first_vertices[-1])
     vertices = np.empty((n_vertices, 3))
     corners = np.empty(first_corners.size, index_dtype(n_vertices))
     run_blocks(
         lambda first, last: _number_vertices(
-            first_corners, soup.positions, BLOCK_SIZE, first_vertices, first, last, corners, vertices
+            first_corners, soup.positions, FINE_BLOCK, first_vertices, first, last, corners, vertices
         ),
         n_blocks,
         threads,
@@ -196,7 +211,7 @@ def _weld_corners(soup: PolygonSoup, threads: int) -> tuple[Floats, Indices, int
         lambda first, last: _number_other_corners(
             first_corners,
             soup.positions,
-            BLOCK_SIZE,
+            FINE_BLOCK,
             tolerance,
             first,
             last,
