@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import os
 import threading
-from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
@@ -48,7 +47,7 @@ LARGE_SHARE = 4
 # Work between two looks at the world, in weights: some ten milliseconds, and much less while a worker waits.
 BUDGET = 64_000_000
 BUFFER_CORNERS = 1 << 18
-_PART_CORNERS = 1 << 13  # of a full buffer, copied by one thread at a time
+_PART_CORNERS = 1 << 15  # of a full buffer, copied by one thread at a time
 
 
 @dataclass
@@ -357,7 +356,7 @@ def _statistics(workers: list[_Worker], pool: _Pool) -> TraversalStatistics:
 
 def _collect(first: _Task, threads: int) -> PolygonSoup:
     """The polygons of all tasks, taken out of them."""
-    chunks: deque[_Chunk] = deque()
+    chunks: list[_Chunk] = []
     task: _Task | None = first
     while task is not None:
         chunks.extend(task.chunks)
@@ -374,33 +373,36 @@ def _collect(first: _Task, threads: int) -> PolygonSoup:
         np.zeros(polygons),
     )
     polygon = corner = 0
-    while chunks:
-        # Chunks are released one by one, so that the soup and they are never held twice.
-        chunk = chunks.popleft()
-        _place_chunk(chunk, soup, polygon, corner, threads)
+    parts: list[tuple[_Chunk, int, int, int, int] | None] = []
+    for chunk in chunks:
+        count = block_count(chunk.box_faces.size, _PART_CORNERS)
+        parts.extend((chunk, part, count, polygon, corner) for part in range(count))
         polygon += chunk.sizes.size
         corner += chunk.box_faces.size
+    del chunks
+
+    def place(begin: int, end: int) -> None:
+        for number in range(begin, end):
+            # A chunk is released with its last part, so that the soup and all chunks are never held together.
+            part, parts[number] = parts[number], None
+            if part is not None:
+                _place_part(soup, *part)
+
+    run_blocks(place, len(parts), threads)
     return soup
 
 
-def _place_chunk(chunk: _Chunk, soup: PolygonSoup, polygon: int, corner: int, threads: int) -> None:
-    """Copy a chunk into the soup, from a polygon and its first corner on.
-
-    In small parts: what takes the time is the first use of the soup's memory.
-    """
+def _place_part(soup: PolygonSoup, chunk: _Chunk, part: int, parts: int, polygon: int, corner: int) -> None:
+    """Copy one of so many equal parts of a chunk to the soup, where the chunk has its first polygon and corner."""
     polygons, corners = chunk.sizes.size, chunk.box_faces.size
-    ends = soup.offsets[polygon + 1 : polygon + polygons + 1]
-    np.cumsum(chunk.sizes, out=ends)
-    ends += corner
-    parts = min(threads, block_count(corners, _PART_CORNERS))
-
-    def place(first: int, last: int) -> None:
-        begin, end = polygons * first // parts, polygons * last // parts
-        soup.gradients[polygon + begin : polygon + end] = chunk.gradients[begin:end]
-        begin, end = corners * first // parts, corners * last // parts
-        target = slice(corner + begin, corner + end)
-        soup.positions[target] = chunk.positions[begin:end]
-        soup.keys[target] = chunk.keys[begin:end].view(np.uint64)
-        soup.box_faces[target] = chunk.box_faces[begin:end]
-
-    run_blocks(place, parts, threads)
+    if part == 0:
+        ends = soup.offsets[polygon + 1 : polygon + polygons + 1]
+        np.cumsum(chunk.sizes, out=ends)
+        ends += corner
+    begin, end = polygons * part // parts, polygons * (part + 1) // parts
+    soup.gradients[polygon + begin : polygon + end] = chunk.gradients[begin:end]
+    begin, end = corners * part // parts, corners * (part + 1) // parts
+    target = slice(corner + begin, corner + end)
+    soup.positions[target] = chunk.positions[begin:end]
+    soup.keys[target] = chunk.keys[begin:end].view(np.uint64)
+    soup.box_faces[target] = chunk.box_faces[begin:end]
