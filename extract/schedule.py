@@ -46,7 +46,7 @@ LEAF_CHOICES = 8
 LARGE_SHARE = 4
 # Work between two looks at the world, in weights: some ten milliseconds, and much less while a worker waits.
 BUDGET = 64_000_000
-BUFFER_CORNERS = 1 << 18
+BUFFER_CORNERS = 1 << 17  # so that no array is so large that numpy asks for huge pages, which are slow to get
 _PART_CORNERS = 1 << 15  # of a full buffer, copied by one thread at a time
 
 
