@@ -241,11 +241,17 @@ class _Pool:
                     self.finished = True
                     self.condition.notify_all()
                     return None
-                for worker in self.workers:
-                    worker.control[entries.ASKED] = 1
+                self._ask()
                 self.condition.wait()
             self.idle -= 1
-            return self.waiting.pop()
+            task = self.waiting.pop()
+            if self.wants_more():
+                self._ask()  # whoever looked while the task was waiting has seen nobody idle
+            return task
+
+    def _ask(self) -> None:
+        for worker in self.workers:
+            worker.control[entries.ASKED] = 1
 
     def finish(self) -> None:
         """A worker is done with its task."""
