@@ -6,6 +6,7 @@ one that depends on the number of threads, so that results are the same for any 
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import itertools
 import os
@@ -36,7 +37,7 @@ def resolve_threads(threads: int | None) -> int:
     Raises ValueError below 1.
     """
     if threads is None:
-        return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+        return len(allowed_cores()) or os.cpu_count() or 1
     if threads < 1:
         raise ValueError(f"threads is {threads}, but at least 1 is needed (None takes all cores)")
     return threads
@@ -72,8 +73,8 @@ def run_blocks(work: Callable[[int, int], object], n_blocks: int, threads: int) 
             raise
 
     helpers = [_helpers(threads - 1, cores).submit(work_on) for _ in range(min(threads, n_tasks) - 1)]
-    keep_to_core(cores, 0, threads)
     try:
+        keep_to_core(cores, 0, threads)
         work_on()
     finally:
         # A helper that has not begun is not needed: all ranges are taken.
@@ -99,9 +100,10 @@ def allowed_cores() -> tuple[int, ...]:
 
 
 def allow_cores(cores: tuple[int, ...]) -> None:
-    """Let the calling thread run on these cores; does nothing if there are none."""
+    """Let the calling thread run on these cores; does nothing if there are none, or if the system refuses."""
     if sys.platform == "linux" and cores:
-        os.sched_setaffinity(0, cores)
+        with contextlib.suppress(OSError):  # a sandbox may forbid it, and it is for speed only
+            os.sched_setaffinity(0, cores)
 
 
 def keep_to_core(cores: tuple[int, ...], number: int, threads: int) -> None:

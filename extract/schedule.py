@@ -7,7 +7,6 @@ come right after the giver's remaining ones, so the order of the output does not
 
 from __future__ import annotations
 
-import os
 import threading
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -15,7 +14,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from mn_onnx.extract.blocks import allowed_cores, block_count, keep_to_core, run_blocks
+from mn_onnx.extract.blocks import allowed_cores, block_count, keep_to_core, resolve_threads, run_blocks
 from mn_onnx.extract.kernels import control as entries
 from mn_onnx.extract.kernels import march as kernel
 from mn_onnx.extract.kernels.memory import (
@@ -44,8 +43,8 @@ Integers = NDArray[np.int64]
 LEAF_CHOICES = 8
 # Cells with one in so many of the network's units left are large: see `how_to_bound` and LEAST_SETTLED.
 LARGE_SHARE = 4
-# Work between two looks at the world, in weights: some ten milliseconds, and much less while a worker waits.
-BUDGET = 64_000_000
+# Work between two looks at the world, in weights: some ten milliseconds; and while another worker waits for work.
+BUDGET, BUDGET_WHILE_ASKED = 64_000_000, 400_000
 BUFFER_CORNERS = 1 << 17  # so that no array is so large that numpy asks for huge pages, which are slow to get
 _PART_CORNERS = 1 << 15  # of a full buffer, copied by one thread at a time
 
@@ -289,17 +288,14 @@ def traverse(
     depend on it. ``progress`` is called from the calling thread a few times a second, and once at the end; what it
     raises stops the workers and is passed on.
 
-    Raises ``ValueError`` for a network that is not canonical or an empty box. An interrupt (KeyboardInterrupt) stops
-    all workers and is passed on.
+    Raises ``ValueError`` for a network that is not canonical, an empty box or fewer than one thread. An interrupt
+    (KeyboardInterrupt) stops all workers and is passed on.
     """
     packed = pack(network, lower, upper)
-    count = threads or os.cpu_count() or 1
-    if count < 1:
-        raise ValueError(f"threads must be at least 1, not {count}")
+    count = resolve_threads(threads)
     first = _Task(packed.F, packed.N, packed.root)
     workers = [_Worker(packed) for _ in range(count)]
     pool = _Pool(first, workers)
-
     cores = allowed_cores()
 
     def work(number: int) -> None:
@@ -308,7 +304,7 @@ def traverse(
             keep_to_core(cores, number, count)
             while (task := pool.take()) is not None:
                 worker.start(task)
-                while not worker.run(task, BUDGET if not pool.wants_more() else BUDGET // 160):
+                while not worker.run(task, BUDGET_WHILE_ASKED if pool.wants_more() else BUDGET):
                     if pool.wants_more() and (given := worker.give_away()) is not None:
                         pool.put(task, given)
                 pool.finish()

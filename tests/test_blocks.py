@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import time
 
 import numpy as np
@@ -88,6 +89,23 @@ def test_the_caller_may_run_anywhere_again_after_an_error() -> None:
     with pytest.raises(RuntimeError, match="no room"):
         run_blocks(work, 8, len(cores))
     assert allowed_cores() == cores
+
+
+@needs_two_cores
+def test_a_system_that_refuses_to_keep_threads_to_cores_still_gets_the_work_done(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def refuse(thread: int, cores: object) -> None:
+        raise PermissionError("not here")
+
+    monkeypatch.setattr(os, "sched_setaffinity", refuse)
+    done = np.zeros(8, np.int64)
+
+    def work(first: int, last: int) -> None:
+        done[first:last] += 1
+
+    run_blocks(work, 8, len(allowed_cores()))
+    assert (done == 1).all()
 
 
 @needs_two_cores

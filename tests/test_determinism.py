@@ -57,7 +57,7 @@ def _assert_same_polygons(first: PolygonSoup, second: PolygonSoup) -> None:
 def test_soup_does_not_depend_on_threads(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Workers give subtrees away after every few cells, whether another one is idle or not."""
     one = _soup(NETWORKS[name], 1)
-    monkeypatch.setattr(schedule, "BUDGET", 5000)
+    monkeypatch.setattr(schedule, "BUDGET_WHILE_ASKED", 250)
     monkeypatch.setattr(schedule._Pool, "wants_more", lambda pool: True)
     for threads in (2, 4):
         other, statistics = traverse(NETWORKS[name], LOWER, UPPER, threads=threads)
