@@ -154,9 +154,9 @@ def _match_at_vertices(
             n_outgoing = n_incoming = 0
             for other in range(valence):
                 n_outgoing += outgoing[other] == head
-                if incoming[other] == head:
-                    n_incoming += 1
-                    partner = before[other]
+                fits = incoming[other] == head
+                n_incoming += fits
+                partner = before[other] if fits else partner
             if n_outgoing != 1 or n_incoming != 1:
                 continue
             if abs(partner - corner) < widest:

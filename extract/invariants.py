@@ -85,7 +85,7 @@ class Invariants:
                 ),
                 (self.off_box_edges, f"{self.off_box_edges} boundary edges do not lie on the box"),
                 (self.flipped_polygons, f"{self.flipped_polygons} polygons face against their gradient"),
-                (self.position_disagreements, f"{self.position_disagreements} corners lie apart from their vertex"),
+                (self.position_disagreements, f"{self.position_disagreements} vertices have corners that lie apart"),
             )
             if count
         ]

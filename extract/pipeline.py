@@ -174,10 +174,13 @@ def _whole_polygons(soup: PolygonSoup) -> tuple[PolygonSoup, int]:
     if whole.all():
         return soup, 0
     corners = np.repeat(whole, sizes)
+    points, first_corners, numbers = np.unique(soup.corners[corners], return_index=True, return_inverse=True)
+    order = np.argsort(first_corners)
     kept = PolygonSoup(
         np.concatenate([np.zeros(1, np.int64), np.cumsum(sizes[whole])]),
-        soup.positions[corners],
-        soup.keys[corners],
+        np.argsort(order)[numbers].astype(soup.corners.dtype),
+        soup.positions[points[order]],
+        soup.keys[points[order]],
         soup.box_faces[corners],
         soup.gradients[whole],
         soup.errors[whole],
@@ -189,7 +192,7 @@ def _torn(surface: Surface) -> tuple[str, ...]:
     """What tells that signs were decided differently in different cells, a sentence each."""
     counts = (
         (surface.unmatched.size, "edges inside the box without neighbour"),
-        (int(surface.report["position_disagreements"]), "corners apart from their vertex"),
+        (int(surface.report["position_disagreements"]), "vertices with corners that lie apart"),
     )
     return tuple(f"{count} {what}" for count, what in counts if count)
 

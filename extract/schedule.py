@@ -9,14 +9,22 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mn_onnx.extract.blocks import allowed_cores, block_count, keep_to_core, resolve_threads, run_blocks
+from mn_onnx.extract.blocks import (
+    allowed_cores,
+    block_count,
+    index_dtype,
+    keep_to_core,
+    resolve_threads,
+    run_blocks,
+)
 from mn_onnx.extract.kernels import control as entries
 from mn_onnx.extract.kernels import march as kernel
+from mn_onnx.extract.kernels.leaf import REMEMBERED
 from mn_onnx.extract.kernels.memory import (
     CELL_END_F,
     CELL_END_I,
@@ -46,6 +54,7 @@ LARGE_SHARE = 4
 # Work between two looks at the world, in weights: some ten milliseconds; and while another worker waits for work.
 BUDGET, BUDGET_WHILE_ASKED = 64_000_000, 400_000
 BUFFER_CORNERS = 1 << 17  # so that no array is so large that numpy asks for huge pages, which are slow to get
+CORNERS_PER_POINT = 2  # a buffer has room for: less than there are, mostly 3 or more
 _PART_CORNERS = 1 << 15  # of a full buffer, copied by one thread at a time
 
 
@@ -79,14 +88,13 @@ class Progress:
 class _Chunk:
     sizes: NDArray[np.int32]
     gradients: Floats
+    corners: NDArray[np.int32]
     positions: Floats
     keys: Integers
     box_faces: NDArray[np.int8]
 
     def copy(self) -> _Chunk:
-        return _Chunk(
-            self.sizes.copy(), self.gradients.copy(), self.positions.copy(), self.keys.copy(), self.box_faces.copy()
-        )
+        return _Chunk(*(getattr(self, field.name).copy() for field in fields(self)))
 
 
 @dataclass
@@ -120,6 +128,7 @@ class _Worker:
         self.control[entries.LARGE_UNITS] = -(-int(packed.N[SYS_UNITS]) // LARGE_SHARE)
         self.stack = np.zeros(1024, np.int64)
         self.slot_of_tag = np.zeros(first_trim_tag(packed.tables.n_knots) + 2 * TRIMMED_DEPTHS, np.int64)
+        self.remembered = np.zeros(REMEMBERED, np.int32)
         self._set_scratch(max(512, -(-largest // 8) * 8))
         self._set_output(BUFFER_CORNERS // 4, BUFFER_CORNERS)
         self.polygons = self.corners = 0
@@ -131,12 +140,14 @@ class _Worker:
 
     def _set_output(self, polygons: int, corners: int) -> None:
         self.output = OutputArrays(
-            np.zeros(2, np.int64),
+            np.zeros(3, np.int64),
             np.empty(polygons, np.int32),
             np.empty((polygons, 3)),
-            np.empty((corners, 3)),
-            np.empty((corners, 2), np.int64),
+            np.empty(corners, np.int32),
+            np.empty((corners // CORNERS_PER_POINT, 3)),
+            np.empty((corners // CORNERS_PER_POINT, 2), np.int64),
             np.empty(corners, np.int8),
+            self.remembered,
         )
 
     def start(self, task: _Task) -> None:
@@ -159,15 +170,16 @@ class _Worker:
 
     def flush(self, task: _Task) -> None:
         """Move the polygons in the buffers to the task: the buffers themselves if they are at least half full."""
-        polygons, corners = (int(count) for count in self.output.counts)
+        polygons, corners, points = (int(count) for count in self.output.counts)
         if not polygons:
             return
         out = self.output
         chunk = _Chunk(
             out.sizes[:polygons],
             out.gradients[:polygons],
-            out.positions[:corners],
-            out.keys[:corners],
+            out.corners[:corners],
+            out.positions[:points],
+            out.keys[:points],
             out.box_faces[:corners],
         )
         if 2 * corners < out.box_faces.size:
@@ -198,8 +210,12 @@ class _Worker:
             else:
                 self.flush(task)
                 polygons, corners = int(self.control[entries.NEED_POLYGONS]), int(self.control[entries.NEED_CORNERS])
-                if polygons > self.output.sizes.size or corners > self.output.keys.shape[0]:
-                    self._set_output(2 * polygons, 2 * corners)
+                out = self.output
+                if polygons > out.sizes.size or corners > out.positions.shape[0]:
+                    # Never smaller than before: `remembered` has numbers of points of the buffers before.
+                    self._set_output(
+                        max(2 * polygons, out.sizes.size), max(2 * CORNERS_PER_POINT * corners, out.corners.size)
+                    )
 
     def give_away(self) -> _Task | None:
         """Take the bottom cell off the stack as a task of its own, if at least one other cell remains."""
@@ -365,22 +381,25 @@ def _collect(first: _Task, threads: int) -> PolygonSoup:
         task.chunks.clear()
         task = task.following
     polygons = sum(chunk.sizes.size for chunk in chunks)
-    corners = sum(chunk.box_faces.size for chunk in chunks)
+    corners = sum(chunk.corners.size for chunk in chunks)
+    points = sum(chunk.positions.shape[0] for chunk in chunks)
     soup = PolygonSoup(
         np.zeros(polygons + 1, np.int64),
-        np.empty((corners, 3)),
-        np.empty((corners, 2), np.uint64),
+        np.empty(corners, index_dtype(points)),
+        np.empty((points, 3)),
+        np.empty((points, 2), np.uint64),
         np.empty(corners, np.int8),
         np.empty((polygons, 3)),
         np.zeros(polygons),
     )
-    polygon = corner = 0
-    parts: list[tuple[_Chunk, int, int, int, int] | None] = []
+    polygon = corner = point = 0
+    parts: list[tuple[_Chunk, int, int, tuple[int, int, int]] | None] = []
     for chunk in chunks:
-        count = block_count(chunk.box_faces.size, _PART_CORNERS)
-        parts.extend((chunk, part, count, polygon, corner) for part in range(count))
+        count = block_count(chunk.corners.size, _PART_CORNERS)
+        parts.extend((chunk, part, count, (polygon, corner, point)) for part in range(count))
         polygon += chunk.sizes.size
-        corner += chunk.box_faces.size
+        corner += chunk.corners.size
+        point += chunk.positions.shape[0]
     del chunks
 
     def place(begin: int, end: int) -> None:
@@ -394,9 +413,10 @@ def _collect(first: _Task, threads: int) -> PolygonSoup:
     return soup
 
 
-def _place_part(soup: PolygonSoup, chunk: _Chunk, part: int, parts: int, polygon: int, corner: int) -> None:
-    """Copy one of so many equal parts of a chunk to the soup, where the chunk has its first polygon and corner."""
-    polygons, corners = chunk.sizes.size, chunk.box_faces.size
+def _place_part(soup: PolygonSoup, chunk: _Chunk, part: int, parts: int, firsts: tuple[int, int, int]) -> None:
+    """Copy one of so many equal parts of a chunk to the soup, where its first polygon, corner and point are."""
+    polygon, corner, point = firsts
+    polygons, corners, points = chunk.sizes.size, chunk.corners.size, chunk.positions.shape[0]
     if part == 0:
         ends = soup.offsets[polygon + 1 : polygon + polygons + 1]
         np.cumsum(chunk.sizes, out=ends)
@@ -404,7 +424,8 @@ def _place_part(soup: PolygonSoup, chunk: _Chunk, part: int, parts: int, polygon
     begin, end = polygons * part // parts, polygons * (part + 1) // parts
     soup.gradients[polygon + begin : polygon + end] = chunk.gradients[begin:end]
     begin, end = corners * part // parts, corners * (part + 1) // parts
-    target = slice(corner + begin, corner + end)
-    soup.positions[target] = chunk.positions[begin:end]
-    soup.keys[target] = chunk.keys[begin:end].view(np.uint64)
-    soup.box_faces[target] = chunk.box_faces[begin:end]
+    np.add(chunk.corners[begin:end], point, out=soup.corners[corner + begin : corner + end], dtype=soup.corners.dtype)
+    soup.box_faces[corner + begin : corner + end] = chunk.box_faces[begin:end]
+    begin, end = points * part // parts, points * (part + 1) // parts
+    soup.positions[point + begin : point + end] = chunk.positions[begin:end]
+    soup.keys[point + begin : point + end] = chunk.keys[begin:end].view(np.uint64)

@@ -1,7 +1,7 @@
-"""Welding: corners with the same combinatorial key become one vertex, opposite half-edges become one edge.
+"""Welding: points with the same combinatorial key become one vertex, opposite half-edges become one edge.
 
-No coordinate decides anything here. Corners are partitioned by key with a counting sort, and each partition finds the
-first corner of every key in its own hash table; vertices are numbered by their first corner in canonical order.
+No coordinate decides anything here. Points are partitioned by key with a counting sort, and each partition finds the
+first point of every key in its own hash table; vertices are numbered by their first corner in canonical order.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ from mn_onnx.extract.soup import PolygonSoup
 from mn_onnx.extract.surface import Surface
 
 POSITION_AGREEMENT = 1e-9
-"""Corners of one vertex may differ by this much, relative to the largest coordinate, before they are reported."""
+"""Points of one vertex may differ by this much, relative to the largest coordinate, before they are reported."""
 
 Floats = NDArray[np.float64]
 
-_CORNERS_PER_PARTITION = 1 << 12  # whose hash table fits in the cache of a core
+_POINTS_PER_PARTITION = 1 << 12  # whose hash table fits in the cache of a core
 _MAX_PARTITION_BITS = 16  # partition numbers fit in uint16
 # Odd constants whose bits look random: xxHash's second prime, and 2^64 over the golden ratio (Knuth, volume 3, 6.4).
 _KEY_MIX = 0xC2B2AE3D27D4EB4F
@@ -48,15 +48,15 @@ def _assign_partitions(
     keys: NDArray[np.uint64], bits: int, block_size: int, first: int, last: int, partitions: NDArray[np.uint16]
 ) -> None:
     """The partition, one of ``2 ** bits``, of the keys in blocks ``first .. last``."""
-    for corner in range(first * block_size, min(last * block_size, partitions.size)):
-        partitions[corner] = _mix(keys[corner, 0], keys[corner, 1]) >> np.uint64(64 - bits)
+    for point in range(first * block_size, min(last * block_size, partitions.size)):
+        partitions[point] = _mix(keys[point, 0], keys[point, 1]) >> np.uint64(64 - bits)
 
 
 @numba.njit(cache=True, nogil=True)
-def _find_first_corners(
-    keys: NDArray[np.uint64], order: Indices, starts: NDArray[np.int64], first: int, last: int, first_corners: Indices
+def _find_first_points(
+    keys: NDArray[np.uint64], order: Indices, starts: NDArray[np.int64], first: int, last: int, first_points: Indices
 ) -> None:
-    """For the corners of partitions ``first .. last``, the first corner in canonical order that has the same key."""
+    """For the points of partitions ``first .. last``, the first point that has the same key."""
     for partition in range(first, last):
         begin, end = starts[partition], starts[partition + 1]
         size = 2
@@ -77,74 +77,87 @@ def _find_first_corners(
             if held < 0:
                 held = item
                 table[slot] = item
-            first_corners[order[begin + item]] = order[begin + held]
+            first_points[order[begin + item]] = order[begin + held]
 
 
 @numba.njit(cache=True, nogil=True)
-def _count_vertices(first_corners: Indices, block_size: int, first: int, last: int, counts: NDArray[np.int64]) -> None:
-    """The number of first corners in each of the blocks ``first .. last``, one place further on in ``counts``."""
+def _count_vertices(first_points: Indices, block_size: int, first: int, last: int, counts: NDArray[np.int64]) -> None:
+    """The number of first points in each of the blocks ``first .. last``, one place further on in ``counts``."""
     for block in range(first, last):
         count = 0
-        for corner in range(block * block_size, min((block + 1) * block_size, first_corners.size)):
-            count += first_corners[corner] == corner
+        for point in range(block * block_size, min((block + 1) * block_size, first_points.size)):
+            count += first_points[point] == point
         counts[block + 1] = count
 
 
 @numba.njit(cache=True, nogil=True)
 def _number_vertices(
-    first_corners: Indices,
+    first_points: Indices,
     positions: Floats,
     block_size: int,
     first_vertices: NDArray[np.int64],
     first: int,
     last: int,
-    corners: Indices,
+    numbers: Indices,
     vertices: Floats,
 ) -> None:
-    """Give the first corners of blocks ``first .. last`` their vertex numbers, and the vertices their positions."""
+    """Give the first points of blocks ``first .. last`` their vertex numbers, and the vertices their positions."""
     for block in range(first, last):
         vertex = first_vertices[block]
-        for corner in range(block * block_size, min((block + 1) * block_size, first_corners.size)):
-            if first_corners[corner] == corner:
-                corners[corner] = vertex
+        for point in range(block * block_size, min((block + 1) * block_size, first_points.size)):
+            if first_points[point] == point:
+                numbers[point] = vertex
                 for axis in range(3):
-                    vertices[vertex, axis] = positions[corner, axis]
+                    vertices[vertex, axis] = positions[point, axis]
                 vertex += 1
 
 
 @numba.njit(cache=True, nogil=True)
-def _number_other_corners(
-    first_corners: Indices,
+def _number_other_points(
+    first_points: Indices,
     positions: Floats,
     block_size: int,
     tolerance: float,
     first: int,
     last: int,
-    corners: Indices,
-    disagreements: NDArray[np.int64],
+    numbers: Indices,
+    apart: NDArray[np.bool_],
     gaps: Floats,
 ) -> None:
-    """Number the corners that are not first, and measure how far each is from the first corner of its vertex."""
+    """Number the points that are not first; mark vertices with a point further than ``tolerance`` from the first one.
+
+    ``gaps``: how far such points are, the farthest one of each block.
+    """
     for block in range(first, last):
-        for corner in range(block * block_size, min((block + 1) * block_size, first_corners.size)):
-            leader = first_corners[corner]
-            if leader == corner:
+        for point in range(block * block_size, min((block + 1) * block_size, first_points.size)):
+            leader = first_points[point]
+            if leader == point:
                 continue
-            corners[corner] = corners[leader]
+            numbers[point] = numbers[leader]
             gap = 0.0
             for axis in range(3):
-                gap = max(gap, abs(positions[corner, axis] - positions[leader, axis]))
-            gaps[block] = max(gaps[block], gap)
+                gap = max(gap, abs(positions[point, axis] - positions[leader, axis]))
             if not gap <= tolerance:
-                disagreements[block] += 1
+                gaps[block] = max(gaps[block], gap)
+                apart[numbers[point]] = True
+
+
+@numba.njit(cache=True, nogil=True)
+def _number_corners(
+    points: Indices, numbers: Indices, block_size: int, first: int, last: int, corners: Indices
+) -> None:
+    """The vertex of each corner in blocks ``first .. last``: that of its point."""
+    for corner in range(first * block_size, min(last * block_size, corners.size)):
+        corners[corner] = numbers[points[corner]]
 
 
 def _check_soup(soup: PolygonSoup) -> None:
-    n_polygons, n_corners = soup.offsets.size - 1, soup.positions.shape[0]
+    n_polygons, n_corners, n_points = soup.offsets.size - 1, soup.corners.size, soup.positions.shape[0]
     expected: dict[str, tuple[tuple[int, ...], type[Any]]] = {
         "offsets": ((n_polygons + 1,), np.int64),
-        "positions": ((n_corners, 3), np.float64),
-        "keys": ((n_corners, 2), np.uint64),
+        "corners": ((n_corners,), np.int32 if soup.corners.dtype == np.int32 else np.int64),
+        "positions": ((n_points, 3), np.float64),
+        "keys": ((n_points, 2), np.uint64),
         "box_faces": ((n_corners,), np.int8),
         "gradients": ((n_polygons, 3), np.float64),
         "errors": ((n_polygons,), np.float64),
@@ -157,19 +170,21 @@ def _check_soup(soup: PolygonSoup) -> None:
     sizes = np.diff(soup.offsets)
     if n_polygons < 0 or soup.offsets[0] != 0 or soup.offsets[-1] != n_corners or (sizes < 3).any():
         problems.append(f"offsets must rise from 0 to the number of corners, {n_corners}, by at least 3 each")
+    if n_corners and not 0 <= soup.corners.min() <= soup.corners.max() < n_points:
+        problems.append(f"corners must be numbers of points, below {n_points}")
     if problems:
         raise ValueError("not a polygon soup: " + "; ".join(problems))
 
 
 def _group_by_key(keys: NDArray[np.uint64], threads: int) -> tuple[Indices, NDArray[np.int64]]:
-    """Corners in partitions such that equal keys share one; as `group_items` returns them."""
-    n_corners = keys.shape[0]
-    bits = min(_MAX_PARTITION_BITS, max(1, (n_corners // _CORNERS_PER_PARTITION).bit_length()))
-    partitions = np.empty(n_corners, np.uint16)
+    """Points in partitions such that equal keys share one; as `group_items` returns them."""
+    n_points = keys.shape[0]
+    bits = min(_MAX_PARTITION_BITS, max(1, (n_points // _POINTS_PER_PARTITION).bit_length()))
+    partitions = np.empty(n_points, np.uint16)
 
     run_blocks(
         lambda first, last: _assign_partitions(keys, bits, FINE_BLOCK, first, last, partitions),
-        block_count(n_corners, FINE_BLOCK),
+        block_count(n_points, FINE_BLOCK),
         threads,
     )
     return group_items(partitions, 1 << bits, threads)
@@ -178,51 +193,43 @@ def _group_by_key(keys: NDArray[np.uint64], threads: int) -> tuple[Indices, NDAr
 def first_of_equal_keys(keys: NDArray[np.uint64], threads: int) -> Indices:
     """For each row of ``keys``, uint64 [n, 2], the first row equal to it: [n]."""
     order, starts = _group_by_key(keys, threads)
-    first_corners = np.empty_like(order)
+    first_points = np.empty_like(order)
     run_blocks(
-        lambda first, last: _find_first_corners(keys, order, starts, first, last, first_corners),
+        lambda first, last: _find_first_points(keys, order, starts, first, last, first_points),
         starts.size - 1,
         threads,
     )
-    return first_corners
+    return first_points
 
 
-def _weld_corners(soup: PolygonSoup, threads: int) -> tuple[Floats, Indices, int, float]:
-    """Vertices, the vertex of each corner, how many corners disagree with their vertex, and by how much at most."""
-    first_corners = first_of_equal_keys(soup.keys, threads)
-    n_blocks = block_count(first_corners.size, FINE_BLOCK)
+def _weld_points(soup: PolygonSoup, threads: int) -> tuple[Floats, Indices, int, float]:
+    """Vertices, the vertex of each point, how many vertices have points apart, and by how much at most."""
+    first_points = first_of_equal_keys(soup.keys, threads)
+    n_blocks = block_count(first_points.size, FINE_BLOCK)
     counts = np.zeros(n_blocks + 1, np.int64)
-    run_blocks(lambda first, last: _count_vertices(first_corners, FINE_BLOCK, first, last, counts), n_blocks, threads)
+    run_blocks(lambda first, last: _count_vertices(first_points, FINE_BLOCK, first, last, counts), n_blocks, threads)
     first_vertices = np.cumsum(counts)
     n_vertices = int(first_vertices[-1])
     vertices = np.empty((n_vertices, 3))
-    corners = np.empty(first_corners.size, index_dtype(n_vertices))
+    numbers = np.empty(first_points.size, index_dtype(n_vertices))
     run_blocks(
         lambda first, last: _number_vertices(
-            first_corners, soup.positions, FINE_BLOCK, first_vertices, first, last, corners, vertices
+            first_points, soup.positions, FINE_BLOCK, first_vertices, first, last, numbers, vertices
         ),
         n_blocks,
         threads,
     )
     tolerance = POSITION_AGREEMENT * max(float(vertices.max(initial=0.0)), -float(vertices.min(initial=0.0)))
-    disagreements = np.zeros(n_blocks, np.int64)
+    apart = np.zeros(n_vertices, np.bool_)
     gaps = np.zeros(n_blocks)
     run_blocks(
-        lambda first, last: _number_other_corners(
-            first_corners,
-            soup.positions,
-            FINE_BLOCK,
-            tolerance,
-            first,
-            last,
-            corners,
-            disagreements,
-            gaps,
+        lambda first, last: _number_other_points(
+            first_points, soup.positions, FINE_BLOCK, tolerance, first, last, numbers, apart, gaps
         ),
         n_blocks,
         threads,
     )
-    return vertices, corners, int(disagreements.sum()), float(gaps.max(initial=0.0))
+    return vertices, numbers, int(np.count_nonzero(apart)), float(gaps.max(initial=0.0))
 
 
 def weld(soup: PolygonSoup, *, threads: int | None = None) -> Surface:
@@ -230,15 +237,21 @@ def weld(soup: PolygonSoup, *, threads: int | None = None) -> Surface:
 
     A vertex stands where its first corner in canonical order stands. The surface's ``report`` tells
 
-    - ``position_disagreements``: corners further than `POSITION_AGREEMENT` (relative) from their vertex: a collision
-      of keys or a degenerate arrangement;
-    - ``max_position_disagreement``: the largest such distance (maximum norm), also when it is within the agreement.
+    - ``position_disagreements``: vertices with a corner further than `POSITION_AGREEMENT` (relative) from the first
+      one: a collision of keys or a degenerate arrangement;
+    - ``max_position_disagreement``: the largest such distance (maximum norm), 0 if there is none.
 
     ``threads``: None takes all cores; the result is the same for any number. Raises ValueError for a malformed soup.
     """
     _check_soup(soup)
     threads = resolve_threads(threads)
-    vertices, corners, disagreements, gap = _weld_corners(soup, threads)
+    vertices, numbers, disagreements, gap = _weld_points(soup, threads)
+    corners = np.empty(soup.corners.size, numbers.dtype)
+    run_blocks(
+        lambda first, last: _number_corners(soup.corners, numbers, FINE_BLOCK, first, last, corners),
+        block_count(corners.size, FINE_BLOCK),
+        threads,
+    )
     twins = pair_half_edges(soup.offsets, corners, vertices.shape[0], threads)
     return Surface(
         vertices=vertices,

@@ -13,8 +13,8 @@ from mn_onnx.errors import MemoryLimitReached, UsageError
 SAFE_SHARE = 0.8
 """Part of the available memory that a run takes unless it is told otherwise."""
 
-WELDING_BYTES = 80
-"""Bytes per polygon corner that a process grows by after the traversal: measured, 49 to weld and up to 75 to check."""
+WELDING_BYTES = 60
+"""Bytes per polygon corner that a process grows by after the traversal: measured, 25 to 50 to weld and check."""
 
 POLISHED_BYTES = 700
 """Bytes per polygon of the polished mesh that a process grows by: measured, 600."""

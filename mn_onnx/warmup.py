@@ -6,7 +6,7 @@ from contextlib import nullcontext
 
 import numpy as np
 
-from mn_onnx.extract.blocks import resolve_threads
+from mn_onnx.extract.blocks import index_dtype, resolve_threads
 from mn_onnx.extract.invariants import check_invariants
 from mn_onnx.extract.sampling import sample_surface
 from mn_onnx.extract.schedule import traverse
@@ -53,6 +53,7 @@ def _octahedral_soup() -> PolygonSoup:
     offsets = np.arange(0, axes.size + 1, DIMENSION)
     return PolygonSoup(
         offsets.astype(np.int64),
+        np.arange(axes.size, dtype=index_dtype(axes.size)),
         positions,
         keys,
         np.full(axes.size, -1, np.int8),

@@ -75,7 +75,10 @@ def sheet(rows: int = 5, columns: int = 7) -> Surface:
 
 
 def soup_of(surface: Surface, seed: int = 0, noise: float = 0.0) -> PolygonSoup:
-    """The surface taken apart: a random 128-bit key per vertex, polygons in random order, corners off by ``noise``."""
+    """The surface taken apart: a random 128-bit key per vertex, polygons in random order, corners off by ``noise``.
+
+    Every corner has a point of its own.
+    """
     generator = np.random.default_rng(seed)
     keys = generator.integers(0, 2**64, (surface.n_vertices, 2), np.uint64)
     order = generator.permutation(surface.n_polygons)
@@ -86,6 +89,7 @@ def soup_of(surface: Surface, seed: int = 0, noise: float = 0.0) -> PolygonSoup:
     positions = surface.vertices[corners] + noise * generator.uniform(-1, 1, (corners.size, 3))
     return PolygonSoup(
         offsets=offsets,
+        corners=np.arange(corners.size),
         positions=positions,
         keys=keys[corners],
         box_faces=surface.box_faces[source],

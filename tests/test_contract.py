@@ -172,7 +172,7 @@ def test_meshes_of_other_vertices_or_polygons_have_no_limit() -> None:
     one_less = replace(
         one_less,
         offsets=offsets,
-        **{name: getattr(one_less, name)[: offsets[-1]] for name in ("positions", "keys", "box_faces")},
+        **{name: getattr(one_less, name)[: offsets[-1]] for name in ("corners", "positions", "keys", "box_faces")},
         **{name: getattr(one_less, name)[:-1] for name in ("gradients", "errors")},
     )
     for one, other in ((soup, other_vertices), (two_quads, one_less)):

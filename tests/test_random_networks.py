@@ -50,9 +50,9 @@ def _assert_exact(network: Network) -> PolygonSoup:
 
 def _face_samples(soup: PolygonSoup) -> np.ndarray:
     """One random convex combination of the corners per polygon."""
-    weights = np.random.default_rng(0).exponential(size=(len(soup.positions), 1))
+    weights = np.random.default_rng(0).exponential(size=(len(soup.corners), 1))
     starts = soup.offsets[:-1]
-    return np.add.reduceat(weights * soup.positions, starts) / np.add.reduceat(weights, starts)
+    return np.add.reduceat(weights * soup.corner_positions, starts) / np.add.reduceat(weights, starts)
 
 
 @pytest.mark.parametrize("choices", [1, 32])

@@ -45,7 +45,7 @@ def limit_surface(
 def _vertex_keys(soup: PolygonSoup, surface: Surface) -> NDArray[np.uint64]:
     """The key of every vertex, uint64 [v, 2]."""
     _, first_corners = np.unique(surface.corners, return_index=True)
-    return soup.keys[first_corners]
+    return np.asarray(soup.keys[soup.corners[first_corners]])
 
 
 def _by_key(keys: NDArray[np.uint64]) -> NDArray[np.int64]:
@@ -56,4 +56,4 @@ def _polygon_words(soup: PolygonSoup) -> NDArray[np.uint64]:
     """Words that tell which vertices a polygon has, uint64 [p, 2]: the sum of its corners' keys, modulo 2^64."""
     if soup.offsets.size == 1:
         return np.zeros((0, 2), np.uint64)
-    return np.asarray(np.add.reduceat(soup.keys, soup.offsets[:-1], axis=0))
+    return np.asarray(np.add.reduceat(soup.corner_keys, soup.offsets[:-1], axis=0))

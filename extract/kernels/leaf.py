@@ -43,18 +43,53 @@ from mn_onnx.extract.kernels.polytope import (
     read_cut_polygon,
 )
 
+# So many recent points are looked at for each corner: they fit in the nearest cache and find 96 % of what there is.
+REMEMBERED = 2048
+# Corners of one vertex that are further from one another, relative to the coordinates, are left for `weld` to judge.
+APART = 2.0**-40
+
+
+@njit(cache=True, error_model="numpy")
+def place_corner(output, points, key0, key1, x, y, z, apart):
+    """The number of the point with these keys at this place: a recent one of ``points``, or the next.
+
+    Three of four corners lie at a point that polygons emitted shortly before have too; `weld` finds the others. A
+    point of the same keys that is ``apart`` from here is another one, so that `weld` can report it.
+    """
+    slot = key0 & (REMEMBERED - 1)
+    recent = np.int64(output.remembered[slot])  # of these buffers, or of others that were here before
+    known = (
+        (recent < points)
+        & (output.keys[2 * recent] == key0)
+        & (output.keys[2 * recent + 1] == key1)
+        & (abs(output.positions[3 * recent] - x) <= apart)
+        & (abs(output.positions[3 * recent + 1] - y) <= apart)
+        & (abs(output.positions[3 * recent + 2] - z) <= apart)
+    )
+    # Whether it is known is hard to guess, so the next point is written in any case.
+    output.positions[3 * points] = x
+    output.positions[3 * points + 1] = y
+    output.positions[3 * points + 2] = z
+    output.keys[2 * points] = key0
+    output.keys[2 * points + 1] = key1
+    point = recent if known else points
+    output.remembered[slot] = point
+    return point
+
 
 @njit(cache=True, error_model="numpy")
 def emit_polygon(X, J, M, output, tables, count, polygon, tags, hash0, hash1, gradient):
     """Append a polygon to the output buffers; the caller has made sure that they have room."""
-    corner = output.counts[1]
+    corner, points = output.counts[1], output.counts[2]
     for j in range(count):
         before = J[tags * M + (j - 1 if j > 0 else count - 1)]
         after = J[tags * M + j]
-        for axis in range(3):
-            output.positions[3 * (corner + j) + axis] = X[(polygon + axis) * M + j]
-        output.keys[2 * (corner + j)] = hash0 ^ tables.tag_hash[2 * before] ^ tables.tag_hash[2 * after]
-        output.keys[2 * (corner + j) + 1] = hash1 ^ tables.tag_hash[2 * before + 1] ^ tables.tag_hash[2 * after + 1]
+        key0 = hash0 ^ tables.tag_hash[2 * before] ^ tables.tag_hash[2 * after]
+        key1 = hash1 ^ tables.tag_hash[2 * before + 1] ^ tables.tag_hash[2 * after + 1]
+        x, y, z = X[polygon * M + j], X[(polygon + 1) * M + j], X[(polygon + 2) * M + j]
+        point = place_corner(output, points, key0, key1, x, y, z, APART * tables.extent)
+        output.corners[corner + j] = point
+        points += point == points
         output.box_faces[corner + j] = (after >> 1) - tables.n_knots if after >= 2 * tables.n_knots else -1
     face = output.counts[0]
     output.sizes[face] = count
@@ -62,6 +97,7 @@ def emit_polygon(X, J, M, output, tables, count, polygon, tags, hash0, hash1, gr
         output.gradients[3 * face + axis] = X[gradient + axis]
     output.counts[0] = face + 1
     output.counts[1] = corner + count
+    output.counts[2] = points
 
 
 @njit(cache=True, error_model="numpy")

@@ -92,7 +92,7 @@ SUMMED, TRACKED, FIRST_LEVEL = 0, 1, 2
 
 
 class Room(NamedTuple):
-    """Sizes of a worker's arrays: arenas, scratch regions, stack, and output buffers in polygons and corners."""
+    """Sizes of a worker's arrays: arenas, scratch regions, stack; output buffers in polygons, corners and points."""
 
     floats: int
     integers: int
@@ -100,6 +100,7 @@ class Room(NamedTuple):
     stack: int
     polygons: int
     corners: int
+    points: int
 
 
 @njit(cache=True, error_model="numpy")
@@ -125,9 +126,11 @@ def point_at_output(output):
         pointer(output.counts),
         pointer(output.sizes),
         pointer(output.gradients),
+        pointer(output.corners),
         pointer(output.positions),
         pointer(output.keys),
         pointer(output.box_faces),
+        pointer(output.remembered),
     )
 
 
@@ -151,7 +154,7 @@ def missing_room(N, control, room, counts, cell, rows, cols, levels):
     if control[STACK_TOP] + 2 > room.stack:
         return STACK_FULL
     polygons, corners = choices, choices * (most + 2 * choices)
-    if counts[0] + polygons > room.polygons or counts[1] + corners > room.corners:
+    if counts[0] + polygons > room.polygons or counts[1] + corners > room.corners or counts[2] + corners > room.points:
         control[NEED_POLYGONS], control[NEED_CORNERS] = polygons, corners
         return OUTPUT_FULL
     return DONE
@@ -283,7 +286,8 @@ def march(worker, tables, output, budget):
     control, stack, slot_of_tag = pointer(worker.control), pointer(worker.stack), pointer(worker.slot_of_tag)
     knots = point_at_tables(tables)
     buffers = point_at_output(output)
-    room = Room(worker.F.size, worker.N.size, M, worker.stack.size, output.sizes.size, output.box_faces.size)
+    sizes = output.sizes.size, output.corners.size, output.positions.shape[0]
+    room = Room(worker.F.size, worker.N.size, M, worker.stack.size, *sizes)
     used = 0
     while control[STACK_TOP] > control[STACK_BOTTOM]:
         if control[STOP] != 0:

@@ -45,11 +45,17 @@ class WorkerArrays(NamedTuple):
 
 
 class OutputArrays(NamedTuple):
-    """One worker's output buffers; ``counts`` holds the numbers of polygons and corners in them."""
+    """One worker's output buffers; ``counts`` holds the numbers of polygons, corners and points in them.
+
+    ``corners``: the point of each corner. ``remembered``: a recent point for each value of some bits of the keys; see
+    `kernels.leaf.place_corner`.
+    """
 
     counts: Integers
     sizes: NDArray[np.int32]
     gradients: Floats
+    corners: NDArray[np.int32]
     positions: Floats
     keys: Integers
     box_faces: NDArray[np.int8]
+    remembered: NDArray[np.int32]

@@ -27,21 +27,22 @@ def disagreements(soup: PolygonSoup, exact: LevelSet) -> list[str]:
     problems: list[str] = []
     vertex_of_key: dict[tuple[int, int], Point] = {}
     key_of_vertex: dict[Point, tuple[int, int]] = {}
+    positions, keys = soup.corner_positions, soup.corner_keys
     for index, facet in enumerate(_matched(soup, exact)):
         corners = slice(soup.offsets[index], soup.offsets[index + 1])
-        order = _rotation(soup.positions[corners], facet)
+        order = _rotation(positions[corners], facet)
         if order is None:
-            problems.append(f"polygon {index}: corners {soup.positions[corners].tolist()}, not {_floats(facet)}")
+            problems.append(f"polygon {index}: corners {positions[corners].tolist()}, not {_floats(facet)}")
             continue
         gradient = np.array([float(a) for a in facet.gradient])
         if not np.allclose(soup.gradients[index], gradient, rtol=TOLERANCE, atol=TOLERANCE):
             problems.append(f"polygon {index}: gradient {soup.gradients[index]}, not {gradient}")
         for corner, (first, second) in enumerate(zip(order, order[1:] + order[:1], strict=True), corners.start):
-            key = (int(soup.keys[corner, 0]), int(soup.keys[corner, 1]))
+            key = (int(keys[corner, 0]), int(keys[corner, 1]))
             if vertex_of_key.setdefault(key, first) != first:
-                problems.append(f"polygon {index}: its key at {soup.positions[corner]} is that of another vertex")
+                problems.append(f"polygon {index}: its key at {positions[corner]} is that of another vertex")
             if key_of_vertex.setdefault(first, key) != key:
-                problems.append(f"polygon {index}: the vertex at {soup.positions[corner]} has more than one key")
+                problems.append(f"polygon {index}: the vertex at {positions[corner]} has more than one key")
             expected = exact.box_faces((first, second)) or [-1]
             if soup.box_faces[corner] not in expected:
                 problems.append(f"polygon {index}: an edge on box face {soup.box_faces[corner]}, not {expected}")
@@ -51,7 +52,7 @@ def disagreements(soup: PolygonSoup, exact: LevelSet) -> list[str]:
 def _matched(soup: PolygonSoup, exact: LevelSet) -> list[Facet]:
     """The exact facet with the nearest centroid and gradient for every polygon of the soup."""
     sizes = np.diff(soup.offsets)
-    centroids = np.add.reduceat(soup.positions, soup.offsets[:-1]) / sizes[:, None]
+    centroids = np.add.reduceat(soup.corner_positions, soup.offsets[:-1]) / sizes[:, None]
     tree = KDTree(np.array([[float(x) for x in (*facet.centroid, *facet.gradient)] for facet in exact.facets]))
     nearest = tree.query(np.concatenate([centroids, soup.gradients], axis=1))[1]
     return [exact.facets[index] for index in nearest]

@@ -21,6 +21,7 @@ def as_soup(exact: LevelSet) -> PolygonSoup:
         offsets=np.concatenate([[0], np.cumsum([len(polygon) for polygon in polygons], dtype=np.int64)]).astype(
             np.int64
         ),
+        corners=np.arange(len(corners)),
         positions=np.array(corners, np.float64).reshape(-1, 3),
         keys=np.array([_key(corner) for corner in corners], np.uint64).reshape(-1, 2),
         box_faces=np.array(faces, np.int8),
