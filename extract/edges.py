@@ -13,6 +13,7 @@ from mn_onnx.extract.blocks import BLOCK_SIZE, FINE_BLOCK, Indices, block_count,
 
 _MAX_PARTITIONS = 1 << 16  # their numbers fit in uint16
 _CORNERS_PER_PARTITION = 1 << 13  # whose counters fit in the cache of a core
+_FEW = 32  # half-edges, or corners, that are compared with one another
 
 
 def half_edge_heads(offsets: NDArray[np.int64], corners: Indices) -> Indices:
@@ -30,28 +31,6 @@ def preceding_corners(offsets: NDArray[np.int64]) -> Indices:
     preceding = np.arange(-1, n_corners - 1, dtype=index_dtype(n_corners))
     preceding[offsets[:-1]] = offsets[1:] - 1
     return preceding
-
-
-@numba.njit(cache=True, nogil=True)
-def _link_corners(
-    offsets: NDArray[np.int64],
-    corners: Indices,
-    block_size: int,
-    first: int,
-    last: int,
-    heads: Indices,
-    preceding: Indices,
-    twins: Indices,
-) -> None:
-    """`half_edge_heads` and `preceding_corners` of the polygons in blocks ``first .. last``; twins are -1 so far."""
-    for polygon in range(first * block_size, min(last * block_size, offsets.size - 1)):
-        begin, end = offsets[polygon], offsets[polygon + 1]
-        previous = end - 1
-        for corner in range(begin, end):
-            preceding[corner] = previous
-            heads[previous] = corners[corner]
-            twins[corner] = -1
-            previous = corner
 
 
 @numba.njit(cache=True, nogil=True)
@@ -89,8 +68,7 @@ def corners_by_vertex(corners: Indices, n_vertices: int, threads: int) -> tuple[
 
     The corners at vertex ``i`` are ``order[starts[i]:starts[i + 1]]``, ascending.
     """
-    wanted = max(1, min(_MAX_PARTITIONS, corners.size // _CORNERS_PER_PARTITION))
-    shift = (-(-n_vertices // wanted) - 1).bit_length()
+    shift = _partition_shift(corners.size, n_vertices)
     n_partitions = -(-n_vertices >> shift)
     partitions = np.empty(corners.size, np.uint16)
 
@@ -112,59 +90,123 @@ def corners_by_vertex(corners: Indices, n_vertices: int, threads: int) -> tuple[
 
 
 @numba.njit(cache=True, nogil=True)
-def _match_at_vertices(
+def _partition_half_edges(
+    offsets: NDArray[np.int64],
+    corners: Indices,
+    shift: int,
+    block_size: int,
+    first: int,
+    last: int,
+    heads: Indices,
+    partitions: NDArray[np.uint16],
+    folded: NDArray[np.bool_],
+) -> None:
+    """`half_edge_heads` of the polygons in blocks ``first .. last``, and half-edges partitioned by their lower end.
+
+    ``folded``: whether a polygon of the block may run along an edge twice, as only one that meets a vertex twice can.
+    """
+    for block in range(first, last):
+        meets_twice = False
+        for polygon in range(block * block_size, min((block + 1) * block_size, offsets.size - 1)):
+            begin, end = offsets[polygon], offsets[polygon + 1]
+            for corner in range(begin, end):
+                head = corners[corner + 1 if corner + 1 < end else begin]
+                heads[corner] = head
+                partitions[corner] = min(corners[corner], head) >> shift
+            if end - begin > _FEW:
+                meets_twice = True  # it would take too long to know
+                continue
+            for corner in range(begin, end):
+                for other in range(corner + 1, end):
+                    meets_twice |= corners[corner] == corners[other]
+        folded[block] = meets_twice
+
+
+@numba.njit(cache=True, nogil=True)
+def _in_one_polygon(offsets: NDArray[np.int64], corner: int, other: int) -> bool:
+    polygon = np.searchsorted(offsets, corner, side="right")
+    return bool(offsets[polygon - 1] <= other < offsets[polygon])
+
+
+@numba.njit(cache=True, nogil=True)
+def _pair_many(edges: NDArray[np.int64], at: Indices, offsets: NDArray[np.int64], twins: Indices) -> None:
+    """Set the twins of the corners ``at``, all of one lower end, in the time of sorting; see `_pair_partitions`."""
+    order = np.argsort(edges, kind="mergesort")  # numba's quicksort takes quadratic time on the fan around a hub
+    first = 0
+    for item in range(edges.size):
+        if item + 1 < edges.size and edges[order[item + 1]] >> 1 == edges[order[first]] >> 1:
+            continue
+        for member in range(first, item + 1):
+            twins[at[order[member]]] = -1
+        corner, twin = at[order[first]], at[order[item]]
+        opposite = edges[order[first]] ^ 1 == edges[order[item]]
+        if item == first + 1 and opposite and not _in_one_polygon(offsets, corner, twin):
+            twins[corner], twins[twin] = twin, corner
+        first = item + 1
+
+
+@numba.njit(cache=True, nogil=True)
+def _pair_partitions(
     offsets: NDArray[np.int64],
     corners: Indices,
     heads: Indices,
-    preceding: Indices,
     order: Indices,
     starts: NDArray[np.int64],
-    widest: int,
-    block_size: int,
+    shift: int,
+    folded: bool,
     first: int,
     last: int,
     twins: Indices,
 ) -> None:
-    """Pair the half-edges at the vertices of blocks ``first .. last``.
+    """Pair the half-edges of partitions ``first .. last``, sorted by their lower ends.
 
-    Both half-edges of an edge are seen from either end: the outgoing one of a corner there, the incoming one of the
-    corner before. The end with fewer corners looks, so that a vertex of huge valence costs no more than its
-    neighbours.
+    ``folded``: whether there may be polygons that run along an edge twice.
     """
-    begin_vertex, end_vertex = first * block_size, min(last * block_size, starts.size - 1)
-    largest = 0
-    for vertex in range(begin_vertex, end_vertex):
-        largest = max(largest, starts[vertex + 1] - starts[vertex])
-    # Of every corner at a vertex: where its half-edge ends, and the half-edge that ends in it and where that begins.
-    outgoing, incoming = np.empty(largest, corners.dtype), np.empty(largest, corners.dtype)
-    before = np.empty(largest, twins.dtype)
-    for vertex in range(begin_vertex, end_vertex):
-        begin, valence = starts[vertex], starts[vertex + 1] - starts[vertex]
-        for k in range(valence):
-            corner = order[begin + k]
-            before[k] = preceding[corner]
-            outgoing[k] = heads[corner]
-            incoming[k] = corners[before[k]]
-        for k in range(valence):
-            head = outgoing[k]
-            excess = valence - (starts[head + 1] - starts[head])
-            if excess > 0 or (excess == 0 and vertex >= head):
-                continue
-            corner = partner = order[begin + k]
-            n_outgoing = n_incoming = 0
-            for other in range(valence):
-                n_outgoing += outgoing[other] == head
-                fits = incoming[other] == head
-                n_incoming += fits
-                partner = before[other] if fits else partner
-            if n_outgoing != 1 or n_incoming != 1:
-                continue
-            if abs(partner - corner) < widest:
-                polygon = np.searchsorted(offsets, corner, side="right")
-                if offsets[polygon - 1] <= partner < offsets[polygon]:
-                    continue
-            twins[corner] = partner
-            twins[partner] = corner
+    for partition in range(first, last):
+        begin, count = starts[partition], starts[partition + 1] - starts[partition]
+        first_vertex = partition << shift
+        ends = np.zeros((1 << shift) + 1, np.int64)
+        lower = np.empty(count, corners.dtype)
+        for item in range(count):
+            corner = order[begin + item]
+            lower[item] = min(corners[corner], heads[corner]) - first_vertex
+            ends[lower[item] + 1] += 1
+        for vertex in range(1 << shift):
+            ends[vertex + 1] += ends[vertex]
+        # Of every half-edge its upper end, twice, plus one if it begins there.
+        edges, at = np.empty(count, np.int64), np.empty(count, order.dtype)
+        for item in range(count):
+            corner = order[begin + item]
+            tail, head = corners[corner], heads[corner]
+            place = ends[lower[item]]
+            ends[lower[item]] = place + 1
+            edges[place] = 2 * max(tail, head) + (tail > head)
+            at[place] = corner
+        bucket = 0
+        for vertex in range(1 << shift):
+            bucket_end = ends[vertex]
+            if bucket_end - bucket > _FEW:
+                _pair_many(edges[bucket:bucket_end], at[bucket:bucket_end], offsets, twins)
+                bucket = bucket_end
+            for item in range(bucket, bucket_end):
+                # Which half-edges meet is as good as random, so nothing branches on it.
+                edge = edges[item]
+                same, partner = 0, item
+                for other in range(bucket, bucket_end):
+                    same += edges[other] >> 1 == edge >> 1
+                    partner = other if edges[other] == edge ^ 1 else partner
+                corner, twin = at[item], at[partner]
+                paired = same == 2 and partner != item
+                if folded:
+                    paired = paired and not _in_one_polygon(offsets, corner, twin)
+                twins[corner] = twin if paired else -1
+            bucket = bucket_end
+
+
+def _partition_shift(n_corners: int, n_vertices: int) -> int:
+    """By how many bits a vertex number is shifted to give its partition."""
+    wanted = max(1, min(_MAX_PARTITIONS, n_corners // _CORNERS_PER_PARTITION))
+    return (-(-n_vertices // wanted) - 1).bit_length()
 
 
 def pair_half_edges(offsets: NDArray[np.int64], corners: Indices, n_vertices: int, threads: int) -> Indices:
@@ -177,19 +219,24 @@ def pair_half_edges(offsets: NDArray[np.int64], corners: Indices, n_vertices: in
     twins: Indices = np.empty(corners.size, index_dtype(corners.size))
     if not corners.size:
         return twins
-    order, starts = corners_by_vertex(corners, n_vertices, threads)
-    heads, preceding = np.empty_like(corners), np.empty_like(twins)
+    shift = _partition_shift(corners.size, n_vertices)
+    heads, partitions = np.empty_like(corners), np.empty(corners.size, np.uint16)
+    n_blocks = block_count(offsets.size - 1, FINE_BLOCK)
+    folded = np.empty(n_blocks, np.bool_)
     run_blocks(
-        lambda first, last: _link_corners(offsets, corners, FINE_BLOCK, first, last, heads, preceding, twins),
-        block_count(offsets.size - 1, FINE_BLOCK),
+        lambda first, last: _partition_half_edges(
+            offsets, corners, shift, FINE_BLOCK, first, last, heads, partitions, folded
+        ),
+        n_blocks,
         threads,
     )
-    widest = int(np.diff(offsets).max())
+    order, starts = group_items(partitions, -(-n_vertices >> shift), threads)
+    any_folded = bool(folded.any())
     run_blocks(
-        lambda first, last: _match_at_vertices(
-            offsets, corners, heads, preceding, order, starts, widest, FINE_BLOCK, first, last, twins
+        lambda first, last: _pair_partitions(
+            offsets, corners, heads, order, starts, shift, any_folded, first, last, twins
         ),
-        block_count(n_vertices, FINE_BLOCK),
+        starts.size - 1,
         threads,
     )
     return twins

@@ -24,7 +24,7 @@ from mn_onnx.extract.kernels import march
 from mn_onnx.warmup import warm_up
 
 surface = warm_up(threads=2)
-kernels = [march.march, weld._find_first_points, edges._match_at_vertices, measures._measure, sampling._place]
+kernels = [march.march, weld._find_first_points, edges._pair_partitions, measures._measure, sampling._place]
 compiled = {kernel.__name__: sum(kernel.stats.cache_misses.values()) for kernel in kernels}
 print(json.dumps({"volume": surface.measures.volumes.sum(), "compiled": compiled}))
 """
@@ -41,7 +41,7 @@ def test_two_processes_compile_every_kernel_once(tmp_path: Path) -> None:
     found = json.loads(done.stdout)
     assert found["volume"] == pytest.approx(1 / 6)  # of the octahedron
     assert found["compiled"] == {
-        "march": 1, "_find_first_points": 0, "_match_at_vertices": 0, "_measure": 0, "_place": 0,
+        "march": 1, "_find_first_points": 0, "_pair_partitions": 0, "_measure": 0, "_place": 0,
     }  # fmt: skip
     # numba numbers the files of a kernel. A second one is for other types of arguments: four lanes after eight, but
     # else a constant among the arguments, or types in which the second process compiles what the first never calls.

@@ -40,17 +40,25 @@ def test_agrees_with_dictionaries(make, seed):
     np.testing.assert_array_equal(surface.vertices[surface.corners], soup.corner_positions)
 
 
-def test_random_polygons_agree_with_dictionaries():
-    """Few vertices and random polygons: every kind of broken edge occurs."""
+@pytest.mark.parametrize("n_vertices", [25, 250])
+def test_random_polygons_agree_with_dictionaries(n_vertices):
+    """Few vertices of many half-edges, or many of few: every kind of broken edge occurs."""
     generator = np.random.default_rng(5)
     sizes = generator.integers(3, 7, 400)
     offsets = np.concatenate([[0], np.cumsum(sizes)])
-    vertices = generator.integers(0, 25, offsets[-1])
+    vertices = generator.integers(0, n_vertices, offsets[-1])
+    # Many polygons run along an edge there and back, and some have a twin that does so the other way.
+    for polygon in range(0, 400, 3):
+        begin = offsets[polygon]
+        vertices[begin + 2] = vertices[begin]
+    for polygon in range(1, 400, 3):
+        begin, end = offsets[polygon : polygon + 2]
+        vertices[end : end + 3] = vertices[begin : begin + 3][::-1]
     soup = dataclasses.replace(
         soup_of(cube()),
         offsets=offsets,
         corners=np.arange(vertices.size),
-        positions=generator.normal(size=(25, 3))[vertices],
+        positions=generator.normal(size=(n_vertices, 3))[vertices],
         keys=np.stack([vertices, np.full_like(vertices, 7)], axis=1).astype(np.uint64),
         box_faces=np.full(vertices.size, -1, np.int8),
         gradients=np.ones((400, 3)),
@@ -184,13 +192,14 @@ def test_malformed_soup_is_refused_with_all_reasons():
         weld(dataclasses.replace(soup, offsets=np.array([0, 2, 24])))
 
 
-def test_a_vertex_of_huge_valence_is_paired_in_linear_time():
-    """A bipyramid: both apices have as many polygons as there are rim vertices."""
+@pytest.mark.parametrize("apices", [(0, 1), (100_000, 100_001)])
+def test_a_vertex_of_huge_valence_is_paired_in_the_time_of_sorting(apices):
+    """A bipyramid: both apices have as many polygons as there are rim vertices; they come first or last."""
     n = 100_000
-    rim = np.arange(n)
-    following = (rim + 1) % n
-    upper = np.stack([rim, following, np.full(n, n)], axis=1)
-    lower = np.stack([following, rim, np.full(n, n + 1)], axis=1)
+    rim = np.arange(n) + (2 if apices[0] == 0 else 0)
+    following = np.roll(rim, -1)
+    upper = np.stack([rim, following, np.full(n, apices[0])], axis=1)
+    lower = np.stack([following, rim, np.full(n, apices[1])], axis=1)
     corners = np.concatenate([upper, lower]).reshape(-1).astype(np.int32)
     offsets = np.arange(2 * n + 1) * 3
     pair_half_edges(offsets[:3], corners[:6], n + 2, 1)
@@ -205,3 +214,16 @@ def test_64_bit_indices_give_the_same_pairs():
     surface = torus()
     twins = pair_half_edges(surface.offsets, surface.corners.astype(np.int64), surface.n_vertices, 2)
     np.testing.assert_array_equal(twins, surface.twins)
+
+
+def test_a_polygon_of_many_corners_meets_its_neighbours():
+    """A prism over a polygon that has too many corners to compare all of them with one another."""
+    n = 500
+    rim = np.arange(n)
+    following = (rim + 1) % n
+    sides = np.stack([rim, following, following + n, rim + n], axis=1)
+    corners = np.concatenate([sides.reshape(-1), rim[::-1], rim + n]).astype(np.int32)
+    offsets = np.concatenate([np.arange(n + 1) * 4, [5 * n, 6 * n]])
+    twins = pair_half_edges(offsets, corners, 2 * n, 1)
+    assert (twins >= 0).all()
+    np.testing.assert_array_equal(twins[twins], np.arange(corners.size))
