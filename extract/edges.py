@@ -63,6 +63,12 @@ def _sort_partitions(
             cursors[vertex] += 1
 
 
+def _partition_shift(n_corners: int, n_vertices: int) -> int:
+    """By how many bits a vertex number is shifted to give its partition."""
+    wanted = max(1, min(_MAX_PARTITIONS, n_corners // _CORNERS_PER_PARTITION))
+    return (-(-n_vertices // wanted) - 1).bit_length()
+
+
 def corners_by_vertex(corners: Indices, n_vertices: int, threads: int) -> tuple[Indices, NDArray[np.int64]]:
     """Corners sorted by vertex: ``order`` [c] and ``starts``, int64 [v + 1].
 
@@ -201,12 +207,6 @@ def _pair_partitions(
                     paired = paired and not _in_one_polygon(offsets, corner, twin)
                 twins[corner] = twin if paired else -1
             bucket = bucket_end
-
-
-def _partition_shift(n_corners: int, n_vertices: int) -> int:
-    """By how many bits a vertex number is shifted to give its partition."""
-    wanted = max(1, min(_MAX_PARTITIONS, n_corners // _CORNERS_PER_PARTITION))
-    return (-(-n_vertices // wanted) - 1).bit_length()
 
 
 def pair_half_edges(offsets: NDArray[np.int64], corners: Indices, n_vertices: int, threads: int) -> Indices:

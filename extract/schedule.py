@@ -54,7 +54,7 @@ LARGE_SHARE = 4
 # Work between two looks at the world, in weights: some ten milliseconds; and while another worker waits for work.
 BUDGET, BUDGET_WHILE_ASKED = 64_000_000, 400_000
 BUFFER_CORNERS = 1 << 17  # so that no array is so large that numpy asks for huge pages, which are slow to get
-CORNERS_PER_POINT = 2  # a buffer has room for: less than there are, mostly 3 or more
+CORNERS_PER_POINT = 2  # that buffers have room for; mostly three or four corners lie at each point
 _PART_CORNERS = 1 << 15  # of a full buffer, copied by one thread at a time
 
 

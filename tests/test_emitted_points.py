@@ -34,7 +34,7 @@ class Buffers:
         self.points = 0
 
     def place(self, key0: int, key1: int, *position: float) -> int:
-        found = int(place_corner(self.arrays, self.points, key0, key1, *position, APART))
+        found = int(place_corner(self.arrays, self.points, key0, key1, *position))
         self.points = max(self.points, found + 1)
         return found
 
@@ -47,12 +47,15 @@ def test_corners_at_one_place_with_one_key_share_a_point() -> None:
     np.testing.assert_array_equal(buffers.arrays.keys[:4], [5, 6, 7, 8])
 
 
+@pytest.mark.parametrize("size", [1e-6, 1.0, 1e6])
 @pytest.mark.parametrize("axis", range(3))
-def test_corners_that_lie_apart_are_points_of_their_own(axis: int) -> None:
+def test_corners_that_lie_apart_are_points_of_their_own(axis: int, size: float) -> None:
     buffers = Buffers()
-    position = np.array([0.1, 0.2, 0.3])
+    position = size * np.array([0.1, 0.2, 0.3])
     assert buffers.place(5, 6, *position) == 0
-    position[axis] += 2 * APART
+    position[axis] += 0.5 * APART * size
+    assert buffers.place(5, 6, *position) == 0
+    position[axis] += 0.5 * APART * size
     assert buffers.place(5, 6, *position) == 1
     position[axis] = np.nan
     assert [buffers.place(5, 6, *position), buffers.place(5, 6, *position)] == [2, 3]

@@ -45,17 +45,18 @@ from mn_onnx.extract.kernels.polytope import (
 
 # So many recent points are looked at for each corner: they fit in the nearest cache and find 96 % of what there is.
 REMEMBERED = 2048
-# Corners of one vertex that are further from one another, relative to the coordinates, are left for `weld` to judge.
+# Corners of one vertex that are further from one another, relative to their coordinates, are left for `weld` to judge.
 APART = 2.0**-40
 
 
 @njit(cache=True, error_model="numpy")
-def place_corner(output, points, key0, key1, x, y, z, apart):
+def place_corner(output, points, key0, key1, x, y, z):
     """The number of the point with these keys at this place: a recent one of ``points``, or the next.
 
     Three of four corners lie at a point that polygons emitted shortly before have too; `weld` finds the others. A
-    point of the same keys that is ``apart`` from here is another one, so that `weld` can report it.
+    point of the same keys that is `APART` from here is another one, so that `weld` can report it.
     """
+    apart = APART * (abs(x) + abs(y) + abs(z))
     slot = key0 & (REMEMBERED - 1)
     recent = np.int64(output.remembered[slot])  # of these buffers, or of others that were here before
     known = (
@@ -87,7 +88,7 @@ def emit_polygon(X, J, M, output, tables, count, polygon, tags, hash0, hash1, gr
         key0 = hash0 ^ tables.tag_hash[2 * before] ^ tables.tag_hash[2 * after]
         key1 = hash1 ^ tables.tag_hash[2 * before + 1] ^ tables.tag_hash[2 * after + 1]
         x, y, z = X[polygon * M + j], X[(polygon + 1) * M + j], X[(polygon + 2) * M + j]
-        point = place_corner(output, points, key0, key1, x, y, z, APART * tables.extent)
+        point = place_corner(output, points, key0, key1, x, y, z)
         output.corners[corner + j] = point
         points += point == points
         output.box_faces[corner + j] = (after >> 1) - tables.n_knots if after >= 2 * tables.n_knots else -1
