@@ -11,11 +11,13 @@ import numpy as np
 from numba import njit
 
 from mn_onnx.extract.kernels.bound import value_range
+from mn_onnx.extract.kernels.lanes import fma, lanes_of, load, splat, store
 from mn_onnx.extract.kernels.memory import (
     CELL_CAPACITY,
     CHOICE,
     CHOICE_FIRST,
     CHOICE_LAST,
+    CHOSEN,
     FORMS,
     OUT_VALUES,
     POLY_A,
@@ -102,50 +104,52 @@ def emit_polygon(X, J, M, output, tables, count, polygon, tags, hash0, hash1, gr
 
 
 @njit(cache=True, error_model="numpy")
-def substitute(F, N, X, J, M, system, tables, row, weights, stride, target):
-    """Add to the affine form ``X[target : target + 4]`` what it reads of rows before ``row`` as chosen.
+def choose_state(N, X, J, M, system, tables, r, state):
+    """Let row ``r`` be in a state, and its outputs, X[CHOSEN], the affine forms that they are then."""
+    J[CHOICE * M + r] = state
+    row_unit = system + SYS_HEADER + N[system + SYS_LEVELS] + 1
+    row_col = row_unit + N[system + SYS_ROWS]
+    unit = N[row_unit + r]
+    pieces = tables.first_knot[unit + 1] - tables.first_knot[unit] + 1
+    piece = tables.first_piece[unit] + state
+    form = load(X, FORMS * M + 4 * r)
+    for c in range(N[row_col + r], N[row_col + r + 1]):
+        constant = lanes_of(0.0, 0.0, 0.0, tables.intercepts[piece])
+        store(X, CHOSEN * M + 4 * c, fma(splat(tables.slopes[piece]), form, constant))
+        piece += pieces
+
+
+@njit(cache=True, error_model="numpy")
+def substitute(F, N, X, M, system, row, form, weights, stride):
+    """The affine ``form`` plus what it reads of the outputs of rows before ``row``, as chosen.
 
     The weight on column ``c`` is ``F[weights + c * stride]``.
     """
     rows = N[system + SYS_ROWS]
-    row_unit = system + SYS_HEADER + N[system + SYS_LEVELS] + 1
-    row_col = row_unit + rows
+    row_col = system + SYS_HEADER + N[system + SYS_LEVELS] + 1 + rows
     col_begin = row_col + rows + 1 + N[system + SYS_COLS]
-    c0, c1, c2, c3 = X[target], X[target + 1], X[target + 2], X[target + 3]
-    for q in range(row):
-        for c in range(N[row_col + q], N[row_col + q + 1]):
-            if N[col_begin + c] > row:
-                break
-            w = F[weights + c * stride]
-            unit = N[row_unit + q]
-            pieces = tables.first_knot[unit + 1] - tables.first_knot[unit] + 1
-            piece = tables.first_piece[unit] + (c - N[row_col + q]) * pieces + J[CHOICE * M + q]
-            slope = w * tables.slopes[piece]
-            at = FORMS * M + 4 * q
-            c0 += slope * X[at]
-            c1 += slope * X[at + 1]
-            c2 += slope * X[at + 2]
-            c3 += slope * X[at + 3] + w * tables.intercepts[piece]
-    X[target], X[target + 1], X[target + 2], X[target + 3] = c0, c1, c2, c3
+    for c in range(N[row_col + row]):
+        if N[col_begin + c] > row:
+            break
+        form = fma(splat(F[weights + c * stride]), load(X, CHOSEN * M + 4 * c), form)
+    return form
 
 
 @njit(cache=True, error_model="numpy")
-def substitute_row(F, N, X, J, M, system, floats, tables, r, target):
+def substitute_row(F, N, X, M, system, floats, r, target):
     """Affine form of row ``r`` at ``X[target : target + 4]`` under the states chosen for the rows before it."""
-    rows = N[system + SYS_ROWS]
-    for axis in range(4):
-        X[target + axis] = F[floats + axis * rows + r]
-    substitute(F, N, X, J, M, system, tables, r, weights_of(floats, rows) + r, rows, target)
+    rows, at = N[system + SYS_ROWS], floats + r
+    form = lanes_of(F[at], F[at + rows], F[at + 2 * rows], F[at + 3 * rows])
+    store(X, target, substitute(F, N, X, M, system, r, form, weights_of(floats, rows) + r, rows))
 
 
 @njit(cache=True, error_model="numpy")
-def substitute_output(F, N, X, J, M, system, floats, tables, target):
+def substitute_output(F, N, X, M, system, floats, target):
     """Affine form of the output at ``X[target : target + 4]`` under the chosen states of all rows."""
     rows, cols = N[system + SYS_ROWS], N[system + SYS_COLS]
     out_weights = weights_of(floats, rows) + cols * rows
-    for axis in range(4):
-        X[target + axis] = F[out_weights + padded(cols) + axis]
-    substitute(F, N, X, J, M, system, tables, rows, out_weights, np.int64(1), target)
+    form = load(F, out_weights + padded(cols))
+    store(X, target, substitute(F, N, X, M, system, rows, form, out_weights, np.int64(1)))
 
 
 @njit(cache=True, error_model="numpy")
@@ -157,7 +161,7 @@ def emit_choice(F, N, X, J, M, output, tables, slot_of_tag, cell, cell_rows, sys
     rows = N[system + SYS_ROWS]
     row_unit = system + SYS_HEADER + N[system + SYS_LEVELS] + 1
     gradient = FORMS * M + 4 * rows
-    substitute_output(F, N, X, J, M, system, floats, tables, gradient)
+    substitute_output(F, N, X, M, system, floats, gradient)
     evaluate_affine(F, N, X, M, cell, OUT_VALUES, X[gradient], X[gradient + 1], X[gradient + 2], X[gradient + 3])
     low, high = value_range(X, M, OUT_VALUES, N[cell + CELL_CAPACITY])
     if low >= 0.0 or high < 0.0:
@@ -207,7 +211,7 @@ def open_choice(F, N, X, J, M, tables, cell, system, floats, r):
         J[CHOICE_LAST * M + r] = 0
         return
     at = FORMS * M + 4 * r
-    substitute_row(F, N, X, J, M, system, floats, tables, r, at)
+    substitute_row(F, N, X, M, system, floats, r, at)
     evaluate_affine(F, N, X, M, cell, VALUES, X[at], X[at + 1], X[at + 2], X[at + 3])
     low, high = value_range(X, M, VALUES, N[cell + CELL_CAPACITY])
     first, last = J[STATE_LOW * M + r], J[STATE_HIGH * M + r]
@@ -218,7 +222,7 @@ def open_choice(F, N, X, J, M, tables, cell, system, floats, r):
         last -= 1
     J[CHOICE_FIRST * M + r] = first
     J[CHOICE_LAST * M + r] = last
-    J[CHOICE * M + r] = first
+    choose_state(N, X, J, M, system, tables, r, first)
 
 
 @njit(cache=True, error_model="numpy")
@@ -243,6 +247,6 @@ def emit_leaf(F, N, X, J, M, output, tables, slot_of_tag, cell, cell_rows, syste
         if r < 0:
             return broken
         if J[CHOICE * M + r] < J[CHOICE_LAST * M + r]:
-            J[CHOICE * M + r] += 1
+            choose_state(N, X, J, M, system, tables, r, J[CHOICE * M + r] + 1)
             r += 1
             opening = True
