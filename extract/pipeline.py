@@ -126,7 +126,7 @@ def extract_surface(network: Network, lower: Floats, upper: Floats, **options: U
     flat_regions = FlatRegions()
     if not degeneracy.found:
         with clock.phase("flat"):
-            flat_regions = find_flat_regions(network, run.lower, run.upper, surface)
+            flat_regions = find_flat_regions(network, run.lower, run.upper, surface, threads=run.threads)
         if flat_regions:
             # A surface that borders on zeros lies in a plane where pieces of f meet: rounding may lose all of it.
             degeneracy = replace(degeneracy, found=("f is zero throughout a part of the box",))
@@ -134,7 +134,7 @@ def extract_surface(network: Network, lower: Floats, upper: Floats, **options: U
         with clock.phase("perturb"):
             surface, degeneracy = _in_the_limit(network, run, surface, degeneracy)
         with clock.phase("flat"):
-            flat_regions = find_flat_regions(network, run.lower, run.upper, surface)
+            flat_regions = find_flat_regions(network, run.lower, run.upper, surface, threads=run.threads)
     return Extraction(surface, statistics, degeneracy, flat_regions, clock.seconds)
 
 

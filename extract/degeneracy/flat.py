@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from mn_onnx.extract.blocks import block_count, resolve_threads, run_matrix_blocks
 from mn_onnx.extract.surface import Surface, unit_vectors
 from mn_onnx.ir.evaluator import Evaluator
 from mn_onnx.ir.network import Network
@@ -18,6 +19,9 @@ N_INSIDE = 4096
 
 N_BESIDE = 1024
 """Polygons of the surface beside which is looked."""
+
+BLOCK = 512
+"""Points that are evaluated together."""
 
 STEP = 1e-6
 """How far from its polygon a point beside the surface lies, relative to the box."""
@@ -41,15 +45,17 @@ class FlatRegions:
         return self.share > 0 or self.bordering > 0
 
 
-def find_flat_regions(network: Network, lower: Floats, upper: Floats, surface: Surface) -> FlatRegions:
+def find_flat_regions(
+    network: Network, lower: Floats, upper: Floats, surface: Surface, *, threads: int | None = None
+) -> FlatRegions:
     """Look for regions of zeros at random points of the box (the same in every call) and just outside the surface.
 
-    ``lower``, ``upper``: float64 [3].
+    ``lower``, ``upper``: float64 [3]. ``threads``: None takes all cores.
     """
     generator = np.random.default_rng(0)
     evaluator = Evaluator(network)
     inside = generator.uniform(lower, upper, (N_INSIDE, network.input_dim))
-    values = evaluator.values(inside)
+    values = _values(evaluator, inside, threads)
     size = float((upper - lower).max())
     largest = float(np.abs(values).max()) or 1.0
     share = _flat_share(evaluator, inside, values, largest, size)
@@ -57,7 +63,24 @@ def find_flat_regions(network: Network, lower: Floats, upper: Floats, surface: S
         return FlatRegions(share)
     polygons = np.linspace(0, surface.n_polygons - 1, min(N_BESIDE, surface.n_polygons)).astype(np.int64)
     beside = surface.centres(polygons) + STEP * size * unit_vectors(surface.gradients[polygons])
-    return FlatRegions(share, _flat_share(evaluator, beside, evaluator.values(beside), largest, size))
+    return FlatRegions(share, _flat_share(evaluator, beside, _values(evaluator, beside, threads), largest, size))
+
+
+def _values(evaluator: Evaluator, points: Floats, threads: int | None) -> Floats:
+    """``f`` at ``points``, on threads of ours.
+
+    Those of numpy's matrix products keep a core busy for some 30 ms after the last one, and a traversal that begins
+    then would share it.
+    """
+    values = np.empty(len(points))
+
+    def work(first: int, last: int) -> None:
+        for block in range(first, last):
+            part = slice(block * BLOCK, (block + 1) * BLOCK)
+            values[part] = evaluator.values(points[part])
+
+    run_matrix_blocks(work, block_count(len(points), BLOCK), resolve_threads(threads))
+    return values
 
 
 def _flat_share(evaluator: Evaluator, points: Floats, values: Floats, largest: float, size: float) -> float:
