@@ -125,6 +125,19 @@ def run_matrix_blocks(work: Callable[[int, int], object], n_blocks: int, threads
         run_blocks(work, n_blocks, threads)
 
 
+def run_matrix_parts(work: Callable[[slice], object], n_items: int, size: int, threads: int) -> None:
+    """`run_matrix_blocks` on slices of ``size`` items each, one at a time.
+
+    What is multiplied together, and so its rounding, does not depend on the threads.
+    """
+
+    def work_on(first: int, last: int) -> None:
+        for block in range(first, last):
+            work(slice(block * size, (block + 1) * size))
+
+    run_matrix_blocks(work_on, block_count(n_items, size), threads)
+
+
 def index_dtype(n_items: int) -> type[Any]:
     """int32 where it can number ``n_items``, else int64."""
     return np.int32 if n_items <= np.iinfo(np.int32).max else np.int64

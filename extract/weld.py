@@ -181,7 +181,6 @@ def _group_by_key(keys: NDArray[np.uint64], threads: int) -> tuple[Indices, NDAr
     n_points = keys.shape[0]
     bits = min(_MAX_PARTITION_BITS, max(1, (n_points // _POINTS_PER_PARTITION).bit_length()))
     partitions = np.empty(n_points, np.uint16)
-
     run_blocks(
         lambda first, last: _assign_partitions(keys, bits, FINE_BLOCK, first, last, partitions),
         block_count(n_points, FINE_BLOCK),

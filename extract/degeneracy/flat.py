@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from mn_onnx.extract.blocks import block_count, resolve_threads, run_matrix_blocks
+from mn_onnx.extract.blocks import resolve_threads, run_matrix_parts
 from mn_onnx.extract.surface import Surface, unit_vectors
 from mn_onnx.ir.evaluator import Evaluator
 from mn_onnx.ir.network import Network
@@ -74,12 +74,10 @@ def _values(evaluator: Evaluator, points: Floats, threads: int | None) -> Floats
     """
     values = np.empty(len(points))
 
-    def work(first: int, last: int) -> None:
-        for block in range(first, last):
-            part = slice(block * BLOCK, (block + 1) * BLOCK)
-            values[part] = evaluator.values(points[part])
+    def work(part: slice) -> None:
+        values[part] = evaluator.values(points[part])
 
-    run_matrix_blocks(work, block_count(len(points), BLOCK), resolve_threads(threads))
+    run_matrix_parts(work, len(points), BLOCK, resolve_threads(threads))
     return values
 
 

@@ -9,14 +9,13 @@ stay on them.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mn_onnx.extract.blocks import run_matrix_blocks
+from mn_onnx.extract.blocks import run_matrix_parts
 from mn_onnx.extract.edges import half_edge_heads
 from mn_onnx.extract.surface import Surface
 from mn_onnx.ir.evaluator import Evaluator
@@ -73,7 +72,7 @@ class TrueField:
         def work(part: slice) -> None:
             result[part] = self._evaluator.values(points[part])
 
-        self._by_blocks(work, len(points))
+        run_matrix_parts(work, len(points), BLOCK, self._threads)
         return result
 
     def values_and_gradients(self, points: Floats) -> tuple[Floats, Floats]:
@@ -83,18 +82,9 @@ class TrueField:
         def work(part: slice) -> None:
             values[part], gradients[part] = self._evaluator.values_and_gradients(points[part])
 
-        self._by_blocks(work, len(points))
+        run_matrix_parts(work, len(points), BLOCK, self._threads)
         gradients[~np.isfinite(gradients).all(axis=1)] = 0.0
         return values, gradients
-
-    def _by_blocks(self, work: Callable[[slice], None], n_points: int) -> None:
-        """Each block by itself: what is evaluated together, and so its rounding, does not depend on the threads."""
-
-        def blocks(first: int, last: int) -> None:
-            for block in range(first, last):
-                work(slice(block * BLOCK, (block + 1) * BLOCK))
-
-        run_matrix_blocks(blocks, -(-n_points // BLOCK), self._threads)
 
 
 @dataclass(eq=False)
