@@ -51,6 +51,9 @@ Integers = NDArray[np.int64]
 LEAF_CHOICES = 8
 # Cells with one in so many of the network's units left are large: see `how_to_bound` and LEAST_SETTLED.
 LARGE_SHARE = 4
+# Cells are shaved (see `kernels.shave`) if their systems have so many levels and units: bounds of shallow systems are
+# tight without, and slices of small ones cost what they save (measured: 24 to 40 units do equally well).
+SHAVED_LEVELS, SHAVED_UNITS = 5, 32
 # Work between two looks at the world, in weights: some ten milliseconds; and while another worker waits for work.
 BUDGET, BUDGET_WHILE_ASKED = 64_000_000, 400_000
 BUFFER_CORNERS = 1 << 17  # so that no array is so large that numpy asks for huge pages, which are slow to get
@@ -65,6 +68,7 @@ class TraversalStatistics:
     nodes: int = 0
     pruned: int = 0
     trimmed: int = 0
+    shaved: int = 0
     leaves: int = 0
     folds: int = 0
     broken_cuts: int = 0
@@ -125,6 +129,8 @@ class _Worker:
         self.N = np.empty(max(1 << 16, 2 * packed.N.size), np.int64)
         self.control = np.zeros(entries.CONTROL_SIZE, np.int64)
         self.control[entries.LEAF_CHOICES] = LEAF_CHOICES
+        self.control[entries.SHAVED_LEVELS] = SHAVED_LEVELS
+        self.control[entries.SHAVED_UNITS] = SHAVED_UNITS
         self.control[entries.LARGE_UNITS] = -(-int(packed.N[SYS_UNITS]) // LARGE_SHARE)
         self.stack = np.zeros(1024, np.int64)
         self.slot_of_tag = np.zeros(first_trim_tag(packed.tables.n_knots) + 2 * TRIMMED_DEPTHS, np.int64)
@@ -134,9 +140,9 @@ class _Worker:
         self.polygons = self.corners = 0
 
     def _set_scratch(self, region: int) -> None:
-        self.X = _aligned_floats(X_REGIONS * region)
-        self.X[:] = 0.0
-        self.J = np.zeros(J_REGIONS * region, np.int64)
+        self.X, self.trial_floats = (_aligned_floats(X_REGIONS * region) for _ in range(2))
+        self.X[:] = self.trial_floats[:] = 0.0
+        self.J, self.trial_integers = (np.zeros(J_REGIONS * region, np.int64) for _ in range(2))
 
     def _set_output(self, polygons: int, corners: int) -> None:
         self.output = OutputArrays(
@@ -194,7 +200,17 @@ class _Worker:
     def run(self, task: _Task, budget: int) -> bool:
         """Work on the task for about ``budget``; True when it is finished or the worker was told to stop."""
         while True:
-            arrays = WorkerArrays(self.F, self.N, self.X, self.J, self.control, self.stack, self.slot_of_tag)
+            arrays = WorkerArrays(
+                self.F,
+                self.N,
+                self.X,
+                self.J,
+                self.control,
+                self.stack,
+                self.slot_of_tag,
+                self.trial_floats,
+                self.trial_integers,
+            )
             status = kernel.march(arrays, self.packed.tables, self.output, budget)
             if status in (kernel.DONE, kernel.STOPPED):
                 self.flush(task)
@@ -361,6 +377,7 @@ def _statistics(workers: list[_Worker], pool: _Pool) -> TraversalStatistics:
         nodes=total(entries.NODES),
         pruned=total(entries.PRUNED),
         trimmed=total(entries.TRIMMED),
+        shaved=total(entries.SHAVED),
         leaves=total(entries.LEAVES),
         folds=total(entries.FOLDS),
         broken_cuts=total(entries.BROKEN_CUTS),

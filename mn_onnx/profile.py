@@ -9,8 +9,8 @@ polytopes and emitting polygons is what counts. The last table groups the same c
 the system has units left: much time where all layers have some means bounds that are loose in depth.
 
 The counts: *pruned* cells that the bound of the output excludes when visited, cells *trimmed* to the slab that the
-surface can reach, *folds* of systems, *leaves* whose polygons were emitted, *deepest* level of the tree, *subtrees*
-given to threads.
+surface can reach, or *shaved* of slices that the surface was proved to miss, *folds* of systems, *leaves* whose
+polygons were emitted, *deepest* level of the tree, *subtrees* given to threads.
 """
 
 from __future__ import annotations
@@ -72,7 +72,7 @@ def profile_text(report: Mapping[str, Any]) -> str:
     lines += [
         "",
         f"cells {traversal['nodes']:,}: pruned {traversal['pruned'] / nodes:.1%}, "
-        f"trimmed {traversal['trimmed'] / nodes:.1%}, "
+        f"trimmed {traversal['trimmed'] / nodes:.1%}, shaved {traversal['shaved'] / nodes:.1%}, "
         f"leaves {traversal['leaves'] / nodes:.1%}, folds {traversal['folds']:,}",
         f"polygons {polygons:,}, cells per polygon {traversal['nodes'] / max(polygons, 1):.2f}, "
         f"deepest {traversal['deepest']}, subtrees {traversal['subtrees']}, threads {traversal['threads']}",

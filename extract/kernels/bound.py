@@ -44,6 +44,7 @@ from mn_onnx.extract.kernels.memory import (
     LOW,
     OFFSET,
     OUT_COEF,
+    OUT_VALUES,
     OUTPUTS,
     RADIUS,
     READ_AT,
@@ -60,6 +61,8 @@ from mn_onnx.extract.kernels.memory import (
     symbol_stride,
     weights_of,
 )
+from mn_onnx.extract.kernels.polytope import evaluate_affine, value_range
+from mn_onnx.extract.kernels.relax import MARGIN
 from mn_onnx.extract.kernels.settle import AGAIN, FIRST, settle_rows
 
 # Large cells are bounded no further than a level of whose units less than one in so many settles: of later levels
@@ -300,7 +303,7 @@ def multiply_columns(F, X, multiplier, column, second, third, fourth, begin, end
 
 
 @njit(cache=True, error_model="numpy")
-def bound_output(F, N, X, M, system, floats):
+def bound_output_form(F, N, X, M, system, floats):
     """Backward pass: the output's linear centre (X[CENTRE_AT], four numbers) and its radius, which is returned."""
     rows, cols = N[system + SYS_ROWS], N[system + SYS_COLS]
     row_col = system + SYS_HEADER + N[system + SYS_LEVELS] + 1 + rows
@@ -363,15 +366,14 @@ def bound_output(F, N, X, M, system, floats):
 
 
 @njit(cache=True, error_model="numpy")
-def value_range(X, M, region, count):
-    """Smallest and largest of the first ``count`` (a multiple of the lane width) values of a region."""
-    low = load(X, region * M)
-    high = low
-    for v in range(4, count, 4):
-        value = load(X, region * M + v)
-        low = smaller(value, low)
-        high = larger(value, high)
-    return (
-        min(min(lane(low, 0), lane(low, 1)), min(lane(low, 2), lane(low, 3))),
-        max(max(lane(high, 0), lane(high, 1)), max(lane(high, 2), lane(high, 3))),
-    )
+def bound_output(F, N, X, M, extent, cell, system, floats):
+    """The output over the cell, after `bound_units`: the range of its linear centre, and how far it may be from that.
+
+    The centre is in X[CENTRE_AT] (four numbers), its values at the cell's vertices in X[OUT_VALUES].
+    """
+    radius = bound_output_form(F, N, X, M, system, floats)
+    at = CENTRE_AT * M
+    evaluate_affine(F, N, X, M, cell, OUT_VALUES, X[at], X[at + 1], X[at + 2], X[at + 3])
+    low, high = value_range(X, M, OUT_VALUES, N[cell + CELL_CAPACITY])
+    size = abs(X[at]) + abs(X[at + 1]) + abs(X[at + 2]) + abs(X[at + 3]) + radius
+    return low, high, radius + MARGIN * size * extent

@@ -1,9 +1,10 @@
 """Branch and fold: the depth-first traversal of one worker, resumable after any cell.
 
 A cell is bounded, dropped if the output cannot reach the level there, trimmed to where it can, folded when enough of
-its units have settled, and split along a knot of a unit whose pre-activation is already affine on it; small cells are
-emitted whole (`leaf`). Large cells are bounded no further than it seems worth it (LEAST_SETTLED), and in deep networks
-only at some depths (`how_to_bound`); then they are only split.
+its units have settled, in deep networks shaved of slices that the surface misses (`shave`), and split along a knot of a
+unit whose pre-activation is already affine on it; small cells are emitted whole (`leaf`). Large cells are bounded no
+further than it seems worth it (LEAST_SETTLED), and in deep networks only at some depths (`how_to_bound`); then they are
+only split.
 `march` returns to its caller, with the worker's state intact, when a budget of work is used up, when it is asked for
 work to share, when an arena or an output buffer might not have room for the next cell, or when it is told to stop.
 """
@@ -12,9 +13,10 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+import numpy as np
 from numba import njit
 
-from mn_onnx.extract.kernels.bound import bound_first_level, bound_output, bound_units, settle_again, value_range
+from mn_onnx.extract.kernels.bound import bound_first_level, bound_output, bound_units, settle_again
 from mn_onnx.extract.kernels.control import (
     ASKED,
     BROKEN_CUTS,
@@ -31,6 +33,7 @@ from mn_onnx.extract.kernels.control import (
     PROFILE,
     PROFILE_BINS,
     PRUNED,
+    SHAVED,
     STACK_BOTTOM,
     STACK_TOP,
     STOP,
@@ -44,7 +47,6 @@ from mn_onnx.extract.kernels.lanes import cycles, pointer
 from mn_onnx.extract.kernels.layout import carry_states, new_row
 from mn_onnx.extract.kernels.leaf import emit_leaf
 from mn_onnx.extract.kernels.memory import (
-    CELL_CAPACITY,
     CELL_DEPTH,
     CELL_END_F,
     CELL_END_I,
@@ -52,10 +54,8 @@ from mn_onnx.extract.kernels.memory import (
     CELL_SYSTEM_F,
     CELL_SYSTEM_I,
     CELL_VERTICES,
-    CENTRE_AT,
     DEAD,
     LINEAR,
-    OUT_VALUES,
     STATE_HIGH,
     STATE_LOW,
     SYS_COLS,
@@ -72,10 +72,17 @@ from mn_onnx.extract.kernels.memory import (
     padded,
     system_ints,
 )
-from mn_onnx.extract.kernels.polytope import evaluate_affine
+from mn_onnx.extract.kernels.polytope import most_vertices
 from mn_onnx.extract.kernels.records import OutputArrays, Tables
-from mn_onnx.extract.kernels.relax import MARGIN
-from mn_onnx.extract.kernels.split import choose_split, push_trimmed, split_cell, trim_cell
+from mn_onnx.extract.kernels.shave import MOST_SLICES, STATELESS, is_worth_shaving, shave_cell
+from mn_onnx.extract.kernels.split import (
+    SHAVED_TRIMMED_SHARE,
+    TRIMMED_SHARE,
+    choose_split,
+    push_trimmed,
+    split_cell,
+    trim_cell,
+)
 
 DONE, BUDGET_USED, ARENA_FULL, SCRATCH_FULL, OUTPUT_FULL, STACK_FULL, STOPPED = 0, 1, 2, 3, 4, 5, 6
 
@@ -138,13 +145,14 @@ def point_at_output(output):
 def missing_room(N, control, room, counts, cell, rows, cols, levels):
     """The status to return if the next cell might not fit anywhere, else DONE; sets the NEED_* entries."""
     vertices = N[cell + CELL_VERTICES]
-    # A cut has at most one vertex a face, and a simple polytope half as many faces as vertices and two. So every cut
-    # adds at most that; a cell is cut three times at most: trimmed on two sides, then split.
-    most = 4 * vertices + 16
+    # A cell is trimmed and shaved by planes of one direction, which comes to a cut on either side, then it is split.
+    most = most_vertices(vertices, np.int64(3))
+    parts = 2 * MOST_SLICES + 1  # without states
     choices = control[LEAF_CHOICES]
     tracking = tracking_floats(rows, cols) if levels >= TRACKED_LEVELS else 0
-    need_f = control[TOP_F] + max(tracking, folding_floats(rows, cols) + 12 * padded(most))
-    need_i = control[TOP_I] + system_ints(rows, cols, levels) + 4 * cell_ints(rows, most)
+    need_f = control[TOP_F] + max(tracking, folding_floats(rows, cols) + 3 * (4 + parts) * padded(most))
+    polytopes = 4 * cell_ints(rows, most) + parts * cell_ints(STATELESS, most)
+    need_i = control[TOP_I] + system_ints(rows, cols, levels) + polytopes
     if need_f > room.floats or need_i > room.integers:
         control[NEED_F], control[NEED_I] = need_f, need_i
         return ARENA_FULL
@@ -208,7 +216,7 @@ def is_leaf(N, J, M, control, system):
 
 # Inlined before LLVM sees it: as a function of its own, all that it calls would be optimised once more.
 @njit(cache=True, error_model="numpy", inline="always")
-def visit(F, N, X, J, M, control, stack, output, tables, slot_of_tag, cell):
+def visit(F, N, X, J, M, control, stack, output, tables, trial_X, trial_J, slot_of_tag, cell):
     """Process one cell that has been taken off the stack."""
     floats, system = N[cell + CELL_SYSTEM_F], N[cell + CELL_SYSTEM_I]
     rows = N[system + SYS_ROWS]
@@ -229,17 +237,13 @@ def visit(F, N, X, J, M, control, stack, output, tables, slot_of_tag, cell):
     leaf = is_leaf(N, J, M, control, system)
     whole = cell
     if bounded:
-        radius = bound_output(F, N, X, M, system, floats)
-        at = CENTRE_AT * M
-        evaluate_affine(F, N, X, M, cell, OUT_VALUES, X[at], X[at + 1], X[at + 2], X[at + 3])
-        low, high = value_range(X, M, OUT_VALUES, N[cell + CELL_CAPACITY])
-        size = abs(X[at]) + abs(X[at + 1]) + abs(X[at + 2]) + abs(X[at + 3]) + radius
-        slack = radius + MARGIN * size * tables.extent
+        low, high, slack = bound_output(F, N, X, M, tables.extent, cell, system, floats)
         if low > slack or high < -slack:
             control[PRUNED] += 1
             return
         if not leaf:
-            cell = trim_cell(F, N, X, J, M, control, tables, slot_of_tag, cell, rows, low, high, slack)
+            share = SHAVED_TRIMMED_SHARE if is_worth_shaving(N, control, system) else TRIMMED_SHARE
+            cell = trim_cell(F, N, X, J, M, control, tables, slot_of_tag, cell, rows, low, high, slack, share)
     if cell != whole:
         control[TRIMMED] += 1
         newly_linear, newly_dead = settle_again(F, N, X, J, M, tables, cell, system, floats)
@@ -264,7 +268,19 @@ def visit(F, N, X, J, M, control, stack, output, tables, slot_of_tag, cell):
     if leaf:
         control[LEAVES] += 1
         control[BROKEN_CUTS] += emit_leaf(F, N, X, J, M, output, tables, slot_of_tag, cell, rows, folded, folded_floats)
-    elif row >= 0:
+        return
+    if bounded and is_worth_shaving(N, control, folded):
+        most = most_vertices(N[whole + CELL_VERTICES], np.int64(2))
+        shaved = shave_cell(
+            F, N, X, J, M, trial_X, trial_J, control, tables, slot_of_tag, cell, rows, folded, folded_floats, most
+        )
+        if shaved != cell:
+            control[SHAVED] += 1
+            cell, rows = shaved, STATELESS
+            bound_first_level(F, N, X, J, M, tables, cell, folded, folded_floats)
+            row, knot = choose_split(N, X, J, M, tables, folded)
+            form = row
+    if row >= 0:
         split_cell(
             F, N, X, J, M, control, stack, tables, slot_of_tag, cell, rows, folded, folded_floats, row, form, knot
         )
@@ -283,6 +299,7 @@ def march(worker, tables, output, budget):
     """
     M = worker.X.size // X_REGIONS
     F, N, X, J = pointer(worker.F), pointer(worker.N), pointer(worker.X), pointer(worker.J)
+    trial_X, trial_J = pointer(worker.trial_floats), pointer(worker.trial_integers)
     control, stack, slot_of_tag = pointer(worker.control), pointer(worker.stack), pointer(worker.slot_of_tag)
     knots = point_at_tables(tables)
     buffers = point_at_output(output)
@@ -307,7 +324,7 @@ def march(worker, tables, output, budget):
         control[DEEPEST] = max(control[DEEPEST], N[cell + CELL_DEPTH])
         used += CELL_WORK + rows * cols
         before = cycles()
-        visit(F, N, X, J, M, control, stack, buffers, knots, slot_of_tag, cell)
+        visit(F, N, X, J, M, control, stack, buffers, knots, trial_X, trial_J, slot_of_tag, cell)
         bin_ = 0
         units = N[system + SYS_UNITS]
         while units > 0:

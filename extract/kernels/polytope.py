@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from mn_onnx.extract.kernels.lanes import fma, load, load_wide, splat, splat_wide, store
+from mn_onnx.extract.kernels.lanes import fma, lane, larger, load, load_wide, smaller, splat, splat_wide, store
 from mn_onnx.extract.kernels.masks import (
     at_least,
     bits_of,
@@ -51,6 +51,17 @@ TINY = 1e-300
 
 
 @njit(cache=True, error_model="numpy")
+def most_vertices(vertices, cuts):
+    """Upper bound of the vertices of a part of a simple polytope that is cut so often.
+
+    A cut has at most one vertex a face, and a simple polytope half as many faces as vertices, and two.
+    """
+    for _ in range(cuts):
+        vertices += (vertices >> 1) + 2
+    return vertices
+
+
+@njit(cache=True, error_model="numpy")
 def evaluate_affine(F, N, X, M, cell, region, a0, a1, a2, a3):
     """``X[region]`` = a . x + a3 at the cell's vertices (and at its padding, which repeats the last one)."""
     x = N[cell + CELL_FLOATS]
@@ -60,6 +71,21 @@ def evaluate_affine(F, N, X, M, cell, region, a0, a1, a2, a3):
     for v in range(0, capacity, 4):
         value = fma(b0, load(F, x + v), fma(b1, load(F, x + capacity + v), fma(b2, load(F, x + 2 * capacity + v), b3)))
         store(X, out + v, value)
+
+
+@njit(cache=True, error_model="numpy")
+def value_range(X, M, region, count):
+    """Smallest and largest of the first ``count`` (a multiple of the lane width) values of a region."""
+    low = load(X, region * M)
+    high = low
+    for v in range(4, count, 4):
+        value = load(X, region * M + v)
+        low = smaller(value, low)
+        high = larger(value, high)
+    return (
+        min(min(lane(low, 0), lane(low, 1)), min(lane(low, 2), lane(low, 3))),
+        max(max(lane(high, 0), lane(high, 1)), max(lane(high, 2), lane(high, 3))),
+    )
 
 
 @njit(cache=True, error_model="numpy")

@@ -33,7 +33,10 @@ class Tables(NamedTuple):
 
 
 class WorkerArrays(NamedTuple):
-    """One worker's memory; see `kernels.memory`."""
+    """One worker's memory; see `kernels.memory`.
+
+    ``trial_floats`` and ``trial_integers`` are scratch like X and J, for parts that are bounded in between.
+    """
 
     F: Floats
     N: Integers
@@ -42,6 +45,8 @@ class WorkerArrays(NamedTuple):
     control: Integers
     stack: Integers
     slot_of_tag: Integers
+    trial_floats: Floats
+    trial_integers: Integers
 
 
 class OutputArrays(NamedTuple):

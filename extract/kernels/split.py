@@ -48,6 +48,8 @@ from mn_onnx.extract.kernels.polytope import copy_polytope, evaluate_affine, fin
 
 # A cell is trimmed if at most this share of the output's range stays. Measured: 0.5 to 0.8 do equally well.
 TRIMMED_SHARE = 0.7
+# The same for cells that are shaved then, from where they were trimmed: 2 to 4 % faster than the share above.
+SHAVED_TRIMMED_SHARE = 0.9
 # Never thinner than this share of the range, nor than this multiple of what the output's centre is summed of: the signs
 # at the vertices of still flatter cells would be rounding.
 THINNEST_SHARE, THINNEST = 0.03, 2.0**-30
@@ -164,18 +166,18 @@ def cut_away(F, N, X, J, M, control, slot_of_tag, cell, rows, sign, reach, tag):
 
 
 @njit(cache=True, error_model="numpy")
-def trim_cell(F, N, X, J, M, control, tables, slot_of_tag, cell, rows, low, high, slack):
-    """The part of the cell between two planes that the surface cannot reach; the cell itself if that is most of it.
+def trim_cell(F, N, X, J, M, control, tables, slot_of_tag, cell, rows, low, high, slack, share):
+    """The part of the cell between two planes that the surface cannot reach; the cell itself if most of it would stay.
 
-    On the surface the output's centre is within ``slack``; on the cell it ranges over ``low..high``. What is cut off
-    would take splits to be rid of, and of a flat cell all bounds are tighter. No polygon reaches the planes, so they
-    leave no edge in the mesh.
+    Most is more than ``share``. On the surface the output's centre is within ``slack``; on the cell it ranges over
+    ``low..high``. What is cut off would take splits to be rid of, and of a flat cell all bounds are tighter. No polygon
+    reaches the planes, so they leave no edge in the mesh.
     """
     at = CENTRE_AT * M
     size = abs(X[at]) + abs(X[at + 1]) + abs(X[at + 2]) + abs(X[at + 3])
     reach = max(slack, THINNEST_SHARE * (high - low), THINNEST * size * tables.extent)
     depth = N[cell + CELL_DEPTH]
-    if depth >= TRIMMED_DEPTHS or min(high, reach) - max(low, -reach) > TRIMMED_SHARE * (high - low):
+    if depth >= TRIMMED_DEPTHS or min(high, reach) - max(low, -reach) > share * (high - low):
         return cell
     tag = first_trim_tag(tables.n_knots) + 2 * depth
     if high > reach:
