@@ -52,8 +52,8 @@ LEAF_CHOICES = 8
 # Cells with one in so many of the network's units left are large: see `how_to_bound` and LEAST_SETTLED.
 LARGE_SHARE = 4
 # Cells are shaved (see `kernels.shave`) if their systems have so many levels and units: bounds of shallow systems are
-# tight without, and slices of small ones cost what they save (measured: 24 to 40 units do equally well).
-SHAVED_LEVELS, SHAVED_UNITS = 5, 32
+# tight without, and slices of small ones cost what they save (measured: 16 to 32 units do equally well).
+SHAVED_LEVELS, SHAVED_UNITS = 5, 24
 # Work between two looks at the world, in weights: some ten milliseconds; and while another worker waits for work.
 BUDGET, BUDGET_WHILE_ASKED = 64_000_000, 400_000
 BUFFER_CORNERS = 1 << 17  # so that no array is so large that numpy asks for huge pages, which are slow to get
