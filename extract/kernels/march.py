@@ -74,7 +74,7 @@ from mn_onnx.extract.kernels.memory import (
 )
 from mn_onnx.extract.kernels.polytope import most_vertices
 from mn_onnx.extract.kernels.records import OutputArrays, Tables
-from mn_onnx.extract.kernels.shave import MOST_SLICES, STATELESS, is_worth_shaving, shave_cell
+from mn_onnx.extract.kernels.shave import LOOSE_SHARE, MOST_SLICES, STATELESS, is_worth_shaving, shave_cell
 from mn_onnx.extract.kernels.split import (
     SHAVED_TRIMMED_SHARE,
     TRIMMED_SHARE,
@@ -236,11 +236,13 @@ def visit(F, N, X, J, M, control, stack, output, tables, trial_X, trial_J, slot_
     linear, dead, bounded = bound_units(F, N, X, J, M, tables, cell, system, floats, control[TOP_F], tracked, large)
     leaf = is_leaf(N, J, M, control, system)
     whole = cell
+    loose = False
     if bounded:
         low, high, slack = bound_output(F, N, X, M, tables.extent, cell, system, floats)
         if low > slack or high < -slack:
             control[PRUNED] += 1
             return
+        loose = min(high, slack) - max(low, -slack) > LOOSE_SHARE * (high - low)
         if not leaf:
             share = SHAVED_TRIMMED_SHARE if is_worth_shaving(N, control, system) else TRIMMED_SHARE
             cell = trim_cell(F, N, X, J, M, control, tables, slot_of_tag, cell, rows, low, high, slack, share)
@@ -269,7 +271,7 @@ def visit(F, N, X, J, M, control, stack, output, tables, trial_X, trial_J, slot_
         control[LEAVES] += 1
         control[BROKEN_CUTS] += emit_leaf(F, N, X, J, M, output, tables, slot_of_tag, cell, rows, folded, folded_floats)
         return
-    if bounded and is_worth_shaving(N, control, folded):
+    if loose and is_worth_shaving(N, control, folded):
         most = most_vertices(N[whole + CELL_VERTICES], np.int64(2))
         shaved = shave_cell(
             F, N, X, J, M, trial_X, trial_J, control, tables, slot_of_tag, cell, rows, folded, folded_floats, most
