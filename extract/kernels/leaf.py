@@ -10,7 +10,6 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from mn_onnx.extract.kernels.bound import value_range
 from mn_onnx.extract.kernels.lanes import fma, lanes_of, load, splat, store
 from mn_onnx.extract.kernels.memory import (
     CELL_CAPACITY,
@@ -43,6 +42,7 @@ from mn_onnx.extract.kernels.polytope import (
     find_cut_edges,
     link_cut_edges,
     read_cut_polygon,
+    value_range,
 )
 
 # So many recent points are looked at for each corner: they fit in the nearest cache and find 96 % of what there is.

@@ -28,7 +28,6 @@ from mn_onnx.extract.kernels.memory import (
     SYS_UNITS,
     TRIMMED_DEPTHS,
     VALUES,
-    cell_ints,
     first_trim_tag,
 )
 from mn_onnx.extract.kernels.polytope import (
@@ -36,16 +35,15 @@ from mn_onnx.extract.kernels.polytope import (
     find_cut_edges,
     link_cut_edges,
     value_range,
-    write_half,
 )
-from mn_onnx.extract.kernels.split import THINNEST
+from mn_onnx.extract.kernels.split import THINNEST, write_part
 
 # Only cells of which the surface may be in at least this share, in terms of the output's range; of others the bounds
 # are tight already. Measured: without this share there is hardly a cell less, and 2 to 3 % more time.
 LOOSE_SHARE = 0.4
 # The first slice on either side is this share of the cell's thickness, and after one that had to stay each is this
-# share of that. After so many that had to stay, the side is left as it is. Measured: shares of 1/8 to 1/3, and one to
-# three slices that stay, differ by some hundredths.
+# share of that. After so many that had to stay, the side is left as it is. Measured: first shares of 1/8 to 1/3, and
+# two or three slices that stay, differ by some hundredths; after one that stays it is too early to stop.
 SLICE_SHARE, SLICES_KEPT = 1.0 / 3.0, 2
 # Slices tried on either side at most; what `shave_cell` takes of the arenas follows from it.
 MOST_SLICES = 6
@@ -69,17 +67,6 @@ def misses_surface(F, N, J, M, trial_X, trial_J, control, tables, part, system, 
     bound_units(F, N, trial_X, trial_J, M, tables, part, system, floats, control[TOP_F], NEITHER, NEITHER)
     low, high, slack = bound_output(F, N, trial_X, M, tables.extent, part, system, floats)
     return low > slack or high < -slack
-
-
-@njit(cache=True, error_model="numpy")
-def write_part(F, N, X, J, M, control, cell, rows, count, side, tag):
-    """Write one half of a cut cell, as a polytope without states, at the top of the arenas; returns its place."""
-    part = control[TOP_I]
-    vertices = write_half(F, N, X, J, M, cell, rows, STATELESS, count, side, tag, part, control[TOP_F])
-    N[part + CELL_DEPTH] = N[cell + CELL_DEPTH]
-    control[TOP_F] += 3 * N[part + CELL_CAPACITY]
-    control[TOP_I] += cell_ints(STATELESS, vertices)
-    return part
 
 
 @njit(cache=True, error_model="numpy")
@@ -113,11 +100,11 @@ def shave_cell(F, N, X, J, M, trial_X, trial_J, control, tables, slot_of_tag, ce
             if not link_cut_edges(J, M, slot_of_tag, count):
                 break
             top_f, top_i = control[TOP_F], control[TOP_I]
-            part = write_part(F, N, X, J, M, control, cell, rows, count, 1 - kept_side, tag + 1 - kept_side)
+            part = write_part(F, N, X, J, M, control, cell, rows, STATELESS, count, 1 - kept_side, tag + 1 - kept_side)
             misses = misses_surface(F, N, J, M, trial_X, trial_J, control, tables, part, system, floats)
             control[TOP_F], control[TOP_I] = top_f, top_i
             if misses:
-                cell = write_part(F, N, X, J, M, control, cell, rows, count, kept_side, tag + kept_side)
+                cell = write_part(F, N, X, J, M, control, cell, rows, STATELESS, count, kept_side, tag + kept_side)
                 rows = STATELESS
                 if kept_side == 0:
                     high = limit

@@ -145,6 +145,20 @@ def split_cell(F, N, X, J, M, control, stack, tables, slot_of_tag, cell, cell_ro
 
 
 @njit(cache=True, error_model="numpy")
+def write_part(F, N, X, J, M, control, cell, rows, part_rows, count, side, tag):
+    """Write one half of a cut cell at the top of the arenas, with room for the states of ``part_rows`` rows.
+
+    Returns its place. The other arguments are those of `write_half`.
+    """
+    part = control[TOP_I]
+    vertices = write_half(F, N, X, J, M, cell, rows, part_rows, count, side, tag, part, control[TOP_F])
+    N[part + CELL_DEPTH] = N[cell + CELL_DEPTH]
+    control[TOP_F] += 3 * N[part + CELL_CAPACITY]
+    control[TOP_I] += cell_ints(part_rows, vertices)
+    return part
+
+
+@njit(cache=True, error_model="numpy")
 def cut_away(F, N, X, J, M, control, slot_of_tag, cell, rows, sign, reach, tag):
     """The part of the cell where ``sign * c(x) >= -reach``, c the output's centre, as a polytope without states.
 
@@ -157,12 +171,7 @@ def cut_away(F, N, X, J, M, control, slot_of_tag, cell, rows, sign, reach, tag):
     count = find_cut_edges(F, N, X, J, M, cell, rows, VALUES)
     if count == 0 or not link_cut_edges(J, M, slot_of_tag, count):
         return cell
-    part = control[TOP_I]
-    vertices = write_half(F, N, X, J, M, cell, rows, rows, count, np.int64(1), tag, part, control[TOP_F])
-    N[part + CELL_DEPTH] = N[cell + CELL_DEPTH]
-    control[TOP_F] += 3 * N[part + CELL_CAPACITY]
-    control[TOP_I] += cell_ints(rows, vertices)
-    return part
+    return write_part(F, N, X, J, M, control, cell, rows, rows, count, np.int64(1), tag)
 
 
 @njit(cache=True, error_model="numpy")
