@@ -41,6 +41,7 @@ from mn_onnx.extract.kernels.memory import (
     symbol_stride,
 )
 from mn_onnx.extract.kernels.records import OutputArrays, WorkerArrays
+from mn_onnx.extract.kernels.slice_points import SLICE_FLOATS, SLICE_INTEGERS
 from mn_onnx.extract.pack import Packed, pack
 from mn_onnx.extract.soup import PolygonSoup
 from mn_onnx.ir.network import Network
@@ -140,9 +141,9 @@ class _Worker:
         self.polygons = self.corners = 0
 
     def _set_scratch(self, region: int) -> None:
-        self.X, self.trial_floats = (_aligned_floats(X_REGIONS * region) for _ in range(2))
-        self.X[:] = self.trial_floats[:] = 0.0
-        self.J, self.trial_integers = (np.zeros(J_REGIONS * region, np.int64) for _ in range(2))
+        self.X, self.slice_floats = (_aligned_floats(regions * region) for regions in (X_REGIONS, SLICE_FLOATS))
+        self.X[:] = self.slice_floats[:] = 0.0
+        self.J, self.slice_integers = (np.zeros(regions * region, np.int64) for regions in (J_REGIONS, SLICE_INTEGERS))
 
     def _set_output(self, polygons: int, corners: int) -> None:
         self.output = OutputArrays(
@@ -208,8 +209,8 @@ class _Worker:
                 self.control,
                 self.stack,
                 self.slot_of_tag,
-                self.trial_floats,
-                self.trial_integers,
+                self.slice_floats,
+                self.slice_integers,
             )
             status = kernel.march(arrays, self.packed.tables, self.output, budget)
             if status in (kernel.DONE, kernel.STOPPED):

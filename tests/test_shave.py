@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
-from ir_networks import dense
+from ir_networks import RELU, dense, naive_values
 
 from mn_onnx.extract import schedule
 from mn_onnx.extract.invariants import check_invariants
 from mn_onnx.extract.schedule import TraversalStatistics, traverse
 from mn_onnx.extract.weld import weld
-from mn_onnx.ir.network import Network
+from mn_onnx.ir.network import AffineRow, Network, Unit
 from mn_onnx.ir.passes import canonicalize
 from oracle.compare import disagreements
 from oracle.level_set import exact_level_set
@@ -93,3 +93,35 @@ def test_polygons_of_shaved_cells_do_not_depend_on_threads(monkeypatch: pytest.M
 def test_shallow_networks_are_not_shaved() -> None:
     network = canonicalize(dense([40, 24], seed=2), lower=LOWER, upper=UPPER).network
     assert traverse(network, LOWER, UPPER, threads=1)[1].shaved == 0
+
+
+def _three_sheets() -> Network:
+    """Zero on three planes; between two of them two terms that cancel, one of a unit that is zero near all planes.
+
+    f along the first coordinate: from -0.8 at -1 to 0.5, back to -0.5, and to 0.8 at 1.
+    """
+    tilted = np.array([1.0, 0.0625, 0.03125])
+    bump = np.array([-0.375, -0.25, -0.125])
+    slope = 4.25
+    profile = np.array([[-1.0, -0.8], [-0.55, 0.5], [0.0, 0.5], [0.4, -0.5], [0.5, -0.5], [1.0, 0.8]])
+    slopes = np.diff(profile[:, 1]) / np.diff(profile[:, 0])
+    turns = dict(zip(profile[1:-1, 0], np.diff(slopes), strict=True))
+    turns |= dict(zip(bump, [-slope, 2.0 * slope, -slope], strict=True))
+    knots = np.array(sorted(turns))
+    coordinates = np.arange(3)
+    units = [Unit(AffineRow(coordinates, tilted, -float(knot)), (RELU,), f"at {knot}") for knot in knots]
+    units.append(Unit(AffineRow(coordinates, -tilted, float(bump[1])), (RELU,), "back"))
+    sides = 3 + np.array([int(np.searchsorted(knots, bump[1])), len(knots)])
+    units.append(Unit(AffineRow(sides, np.full(2, -slope), slope * 0.125), (RELU,), "bump"))
+    columns = np.concatenate([coordinates, 3 + np.arange(len(knots)), [3 + len(knots) + 1]])
+    weights = np.concatenate([slopes[0] * tilted, [turns[knot] for knot in knots], [1.0]])
+    return Network(3, tuple(units), AffineRow(columns, weights, float(profile[0, 1] + slopes[0])))
+
+
+def test_slices_without_surface_between_others_keep_their_states(monkeypatch: pytest.MonkeyPatch) -> None:
+    _shave(monkeypatch, ALL, ALL)
+    monkeypatch.setattr(schedule, "LARGE_SHARE", 0.1)  # so that the whole box is bounded, too
+    network = canonicalize(_three_sheets(), lower=LOWER, upper=UPPER).network
+    points = np.linspace(LOWER, UPPER, 2001)
+    assert np.count_nonzero(np.diff(np.sign(naive_values(network, points, tables=True)))) == 3
+    assert _assert_exact(network).shaved > 0

@@ -74,7 +74,7 @@ from mn_onnx.extract.kernels.memory import (
 )
 from mn_onnx.extract.kernels.polytope import most_vertices
 from mn_onnx.extract.kernels.records import OutputArrays, Tables
-from mn_onnx.extract.kernels.shave import LOOSE_SHARE, MOST_SLICES, STATELESS, is_worth_shaving, shave_cell
+from mn_onnx.extract.kernels.shave import LOOSE_SHARE, NO_SURFACE, STATELESS, is_worth_shaving, shave_cell
 from mn_onnx.extract.kernels.split import (
     SHAVED_TRIMMED_SHARE,
     TRIMMED_SHARE,
@@ -147,7 +147,7 @@ def missing_room(N, control, room, counts, cell, rows, cols, levels):
     vertices = N[cell + CELL_VERTICES]
     # A cell is trimmed and shaved by planes of one direction, which comes to a cut on either side, then it is split.
     most = most_vertices(vertices, np.int64(3))
-    parts = 2 * MOST_SLICES + 1  # without states
+    parts = 2  # without states
     choices = control[LEAF_CHOICES]
     tracking = tracking_floats(rows, cols) if levels >= TRACKED_LEVELS else 0
     need_f = control[TOP_F] + max(tracking, folding_floats(rows, cols) + 3 * (4 + parts) * padded(most))
@@ -216,7 +216,7 @@ def is_leaf(N, J, M, control, system):
 
 # Inlined before LLVM sees it: as a function of its own, all that it calls would be optimised once more.
 @njit(cache=True, error_model="numpy", inline="always")
-def visit(F, N, X, J, M, control, stack, output, tables, trial_X, trial_J, slot_of_tag, cell):
+def visit(F, N, X, J, M, control, stack, output, tables, S, K, slot_of_tag, cell):
     """Process one cell that has been taken off the stack."""
     floats, system = N[cell + CELL_SYSTEM_F], N[cell + CELL_SYSTEM_I]
     rows = N[system + SYS_ROWS]
@@ -271,14 +271,20 @@ def visit(F, N, X, J, M, control, stack, output, tables, trial_X, trial_J, slot_
         control[LEAVES] += 1
         control[BROKEN_CUTS] += emit_leaf(F, N, X, J, M, output, tables, slot_of_tag, cell, rows, folded, folded_floats)
         return
+    changed = cell != whole
     if loose and is_worth_shaving(N, control, folded):
         most = most_vertices(N[whole + CELL_VERTICES], np.int64(2))
-        shaved = shave_cell(
-            F, N, X, J, M, trial_X, trial_J, control, tables, slot_of_tag, cell, rows, folded, folded_floats, most
+        shaved, settled = shave_cell(
+            F, N, X, J, M, S, K, control, tables, slot_of_tag, cell, rows, folded, folded_floats, most
         )
-        if shaved != cell:
-            control[SHAVED] += 1
-            cell, rows = shaved, STATELESS
+        if shaved == NO_SURFACE:
+            control[PRUNED] += 1
+            return
+        if shaved != cell or settled > 0:
+            changed = True
+            if shaved != cell:
+                control[SHAVED] += 1
+                cell, rows = shaved, STATELESS
             bound_first_level(F, N, X, J, M, tables, cell, folded, folded_floats)
             row, knot = choose_split(N, X, J, M, tables, folded)
             form = row
@@ -286,7 +292,7 @@ def visit(F, N, X, J, M, control, stack, output, tables, trial_X, trial_J, slot_
         split_cell(
             F, N, X, J, M, control, stack, tables, slot_of_tag, cell, rows, folded, folded_floats, row, form, knot
         )
-    elif cell != whole:
+    elif changed:
         push_trimmed(F, N, J, M, control, stack, cell, rows, folded, folded_floats)
     else:
         control[BROKEN_CUTS] += 1  # only if the network is not finite here: the first unstable row is affine
@@ -301,7 +307,7 @@ def march(worker, tables, output, budget):
     """
     M = worker.X.size // X_REGIONS
     F, N, X, J = pointer(worker.F), pointer(worker.N), pointer(worker.X), pointer(worker.J)
-    trial_X, trial_J = pointer(worker.trial_floats), pointer(worker.trial_integers)
+    S, K = pointer(worker.slice_floats), pointer(worker.slice_integers)
     control, stack, slot_of_tag = pointer(worker.control), pointer(worker.stack), pointer(worker.slot_of_tag)
     knots = point_at_tables(tables)
     buffers = point_at_output(output)
@@ -326,7 +332,7 @@ def march(worker, tables, output, budget):
         control[DEEPEST] = max(control[DEEPEST], N[cell + CELL_DEPTH])
         used += CELL_WORK + rows * cols
         before = cycles()
-        visit(F, N, X, J, M, control, stack, buffers, knots, trial_X, trial_J, slot_of_tag, cell)
+        visit(F, N, X, J, M, control, stack, buffers, knots, S, K, slot_of_tag, cell)
         bin_ = 0
         units = N[system + SYS_UNITS]
         while units > 0:

@@ -35,7 +35,8 @@ class Tables(NamedTuple):
 class WorkerArrays(NamedTuple):
     """One worker's memory; see `kernels.memory`.
 
-    ``trial_floats`` and ``trial_integers`` are scratch like X and J, for parts that are bounded in between.
+    ``slice_floats`` and ``slice_integers`` are scratch like X and J, for the slices of a cell; see
+    `kernels.slices`.
     """
 
     F: Floats
@@ -45,8 +46,8 @@ class WorkerArrays(NamedTuple):
     control: Integers
     stack: Integers
     slot_of_tag: Integers
-    trial_floats: Floats
-    trial_integers: Integers
+    slice_floats: Floats
+    slice_integers: Integers
 
 
 class OutputArrays(NamedTuple):

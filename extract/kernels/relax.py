@@ -52,6 +52,21 @@ def relax_piece_range(knots, slopes, intercepts, knot, piece, first, last, low, 
 
 
 @njit(cache=True, error_model="numpy")
+def narrow_states(knots, knot, pieces, first, last, low, high):
+    """The states ``first..last`` that pre-activations in [low, high] may have, and the part of the range in them."""
+    while first < last and low >= knots[knot + first]:
+        first += 1
+    while last > first and high < knots[knot + last - 1]:
+        last -= 1
+    # A cell that was split here lies on one side of the knot, whatever the radius says.
+    if first > 0 and low < knots[knot + first - 1] < high:
+        low = knots[knot + first - 1]
+    if last < pieces - 1 and low < knots[knot + last] < high:
+        high = knots[knot + last]
+    return first, last, low, high
+
+
+@njit(cache=True, error_model="numpy")
 def settle_row(N, X, J, M, tables, cols, r, unit):
     """Tighten the state range of row ``r`` by its bounds and relax its outputs.
 
@@ -65,15 +80,7 @@ def settle_row(N, X, J, M, tables, cols, r, unit):
         reach = bound_radius(X, M, tables.extent, r)
         low -= reach
         high += reach
-        while first < last and low >= knots[knot + first]:
-            first += 1
-        while last > first and high < knots[knot + last - 1]:
-            last -= 1
-        # A cell that was split here lies on one side of the knot, whatever the radius says.
-        if first > 0 and low < knots[knot + first - 1] < high:
-            low = knots[knot + first - 1]
-        if last < pieces - 1 and low < knots[knot + last] < high:
-            high = knots[knot + last]
+        first, last, low, high = narrow_states(knots, knot, pieces, first, last, low, high)
         J[STATE_LOW * M + r] = first
         J[STATE_HIGH * M + r] = last
         X[LOW * M + r] = low
