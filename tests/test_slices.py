@@ -80,11 +80,16 @@ class _Slices(NamedTuple):
 
 
 @njit  # type: ignore[untyped-decorator]
-def _bound_cell(F: Any, N: Any, X: Any, J: Any, tables: Any, root: int, cell: int) -> tuple[float, float, float]:
+def _load_states(N: Any, J: Any, root: int) -> None:
     rows = N[SYS_ROWS]
     for r in range(rows):
         J[STATE_LOW * M + r] = N[root + CELL_HEADER + r]
         J[STATE_HIGH * M + r] = N[root + CELL_HEADER + rows + r]
+
+
+@njit  # type: ignore[untyped-decorator]
+def _bound_cell(F: Any, N: Any, X: Any, J: Any, tables: Any, root: int, cell: int) -> tuple[float, float, float]:
+    _load_states(N, J, root)
     bound_units(F, N, X, J, M, tables, cell, 0, 0, 0, False, False)
     low, high, slack = bound_output(F, N, X, M, tables.extent, cell, 0, 0)
     return low, high, slack
@@ -115,9 +120,7 @@ def _bound(
     placed = place_points(F, N, X, S, K, M, root, rows, low, thickness)
     _bound_cell(F, N, X, J, tables, root, root)
     # Whatever rows the cell settles, slices are given none of it.
-    for r in range(rows):
-        J[STATE_LOW * M + r] = N[root + CELL_HEADER + r]
-        J[STATE_HIGH * M + r] = N[root + CELL_HEADER + rows + r]
+    _load_states(N, J, root)
     count = bound_rows(F, N, S, J, K, M, tables, 0, 0)
     lows, highs, slacks = bound_slice_outputs(F, N, S, K, M, tables.extent, 0, 0, count)
     for k in range(SLICES):

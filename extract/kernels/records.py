@@ -36,7 +36,7 @@ class WorkerArrays(NamedTuple):
     """One worker's memory; see `kernels.memory`.
 
     ``slice_floats`` and ``slice_integers`` are scratch like X and J, for the slices of a cell; see
-    `kernels.slices`.
+    `kernels.slice_points`.
     """
 
     F: Floats

@@ -7,6 +7,8 @@ from __future__ import annotations
 
 from numba import njit
 
+from mn_onnx.extract.kernels.lanes import fma, magnitude, splat_wide
+from mn_onnx.extract.kernels.masks import choose, divide, either
 from mn_onnx.extract.kernels.memory import (
     DEAD,
     ERROR,
@@ -31,6 +33,33 @@ def bound_radius(X, M, extent, r):
     radius = X[RADIUS * M + r]
     size = abs(X[r]) + abs(X[M + r]) + abs(X[2 * M + r]) + abs(X[3 * M + r]) + radius
     return radius + MARGIN * size * extent if radius > 0.0 else 0.0
+
+
+@njit(cache=True, error_model="numpy")
+def with_rounding(c0, c1, c2, c3, radius, extent):
+    """Radii around affine forms, with what rounding may add, in eight lanes."""
+    one = splat_wide(1.0)
+    size = fma(one, magnitude(c0), magnitude(c1))
+    size = fma(one, magnitude(c3), fma(one, radius, fma(one, magnitude(c2), size)))
+    return fma(size, splat_wide(MARGIN * extent), radius)
+
+
+@njit(cache=True, error_model="numpy")
+def relax_one_knot(knot, left, left_at, right, right_at, low, high, above, under):
+    """Slopes, offsets and errors over [low, high] of units of one knot and two pieces, in eight lanes.
+
+    Exact where the masks say that the range is ``above`` or ``under`` the knot, else by the chord.
+    """
+    zero, half, minus = splat_wide(0.0), splat_wide(0.5), splat_wide(-1.0)
+    at_low = fma(left, low, left_at)
+    chord = divide(fma(minus, at_low, fma(right, high, right_at)), fma(minus, low, high))
+    deviation = fma(minus, at_low, fma(left, knot, left_at))
+    deviation = fma(fma(minus, low, knot), fma(minus, chord, zero), deviation)
+    middle = fma(half, deviation, fma(fma(minus, chord, zero), low, at_low))
+    slope = choose(above, right, choose(under, left, chord))
+    offset = choose(above, right_at, choose(under, left_at, middle))
+    error = choose(either(above, under), zero, fma(half, magnitude(deviation), zero))
+    return slope, offset, error
 
 
 @njit(cache=True, error_model="numpy")

@@ -17,7 +17,6 @@ from mn_onnx.extract.kernels.masks import (
     choose,
     count_bits,
     count_up,
-    divide,
     either,
     is_below,
     load_integers,
@@ -48,7 +47,7 @@ from mn_onnx.extract.kernels.memory import (
     UNSTABLE,
     knots_of,
 )
-from mn_onnx.extract.kernels.relax import MARGIN, settle_row
+from mn_onnx.extract.kernels.relax import relax_one_knot, settle_row, with_rounding
 
 # Whether rows are settled on a cell for the first time, or again after it has been trimmed.
 FIRST, AGAIN = np.bool_(False), np.bool_(True)
@@ -61,30 +60,21 @@ def settle_eight(F, X, J, M, extent, table, rows, r, inside):
     ``table``: where the system's knots begin in F. Tightens STATE_LOW and STATE_HIGH and sets KIND. Returns slopes,
     offsets and errors, the masks of settled rows and of those whose output is zero, and the kinds.
     """
-    zero, half, one = splat_wide(0.0), splat_wide(0.5), splat_wide(1.0)
+    zero, one = splat_wide(0.0), splat_wide(1.0)
     no, yes = splat_integer(0), splat_integer(1)
     knot, left, left_at = load_wide(F, table + r), load_wide(F, table + rows + r), load_wide(F, table + 2 * rows + r)
     right, right_at = load_wide(F, table + 3 * rows + r), load_wide(F, table + 4 * rows + r)
     radius = load_wide(X, RADIUS * M + r)
-    size = fma(one, magnitude(load_wide(X, r)), magnitude(load_wide(X, M + r)))
-    size = fma(one, magnitude(load_wide(X, 2 * M + r)), size)
-    size = fma(one, magnitude(load_wide(X, 3 * M + r)), fma(one, radius, size))
-    # With what rounding may add; exactly 0 for a row that is affine on the cell.
-    reach = choose(is_below(zero, radius), fma(size, splat_wide(MARGIN * extent), radius), zero)
+    c0, c1, c2, c3 = load_wide(X, r), load_wide(X, M + r), load_wide(X, 2 * M + r), load_wide(X, 3 * M + r)
+    # Exactly 0 for a row that is affine on the cell.
+    reach = choose(is_below(zero, radius), with_rounding(c0, c1, c2, c3, radius, extent), zero)
     low = fma(splat_wide(-1.0), reach, load_wide(X, LOW * M + r))
     high = fma(one, reach, load_wide(X, HIGH * M + r))
     first, last = load_integers(J, STATE_LOW * M + r), load_integers(J, STATE_HIGH * M + r)
     above = either(same(first, yes), both(same(last, yes), at_least(low, knot)))
     under = without(either(same(last, no), is_below(high, knot)), above)
     settled = either(above, under)
-    at_low = fma(left, low, left_at)
-    chord = divide(fma(splat_wide(-1.0), at_low, fma(right, high, right_at)), fma(splat_wide(-1.0), low, high))
-    deviation = fma(splat_wide(-1.0), at_low, fma(left, knot, left_at))
-    deviation = fma(fma(splat_wide(-1.0), low, knot), fma(splat_wide(-1.0), chord, zero), deviation)
-    middle = fma(half, deviation, fma(fma(splat_wide(-1.0), chord, zero), low, at_low))
-    slope = choose(above, right, choose(under, left, chord))
-    offset = choose(above, right_at, choose(under, left_at, middle))
-    error = choose(settled, zero, fma(half, magnitude(deviation), zero))
+    slope, offset, error = relax_one_knot(knot, left, left_at, right, right_at, low, high, above, under)
     dead = both(settled, both(same(slope, zero), same(offset, zero)))
     kind = choose(dead, splat_integer(DEAD), choose(settled, splat_integer(LINEAR), splat_integer(UNSTABLE)))
     store(J, STATE_LOW * M + r, choose(inside, choose(above, yes, no), first))

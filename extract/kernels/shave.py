@@ -1,4 +1,4 @@
-"""Shaving: slices are cut off a cell as long as bounds on the slice alone prove that the surface misses it.
+"""Shaving: slices at either end of a cell are cut off if bounds on each slice alone prove that the surface misses it.
 
 Bounds get tighter with the size of what they are for, and faster so than linearly in deep networks, where the range of
 a unit grows by the widths of all levels before. So thin slices of a cell can be dropped that no bound on the whole cell
@@ -72,8 +72,8 @@ def shave_cell(F, N, X, J, M, S, K, control, tables, slot_of_tag, cell, rows, sy
 
     That is a polytope without states, or the cell itself if nothing goes. ``rows``: those of the cell's own system,
     ``system`` the folded one, whose rows have their states in J; they are narrowed to those of the slices that
-    stay. ``most``: how many vertices a part may have. ``S``, ``K``: scratch, see `slices`. Also returns
-    how many rows have been settled.
+    stay. ``most``: how many vertices a part may have. ``S``, ``K``: scratch, see `slice_points`. Also returns how many
+    rows have been settled.
     """
     at = CENTRE_AT * M
     evaluate_affine(F, N, X, M, cell, OUT_VALUES, X[at], X[at + 1], X[at + 2], X[at + 3])

@@ -21,8 +21,6 @@ from mn_onnx.extract.kernels.masks import (
     at_least,
     bits_of,
     both,
-    choose,
-    divide,
     either,
     is_below,
     mask_of,
@@ -39,7 +37,7 @@ from mn_onnx.extract.kernels.memory import (
     padded,
     weights_of,
 )
-from mn_onnx.extract.kernels.relax import MARGIN, narrow_states, relax_piece_range
+from mn_onnx.extract.kernels.relax import narrow_states, relax_one_knot, relax_piece_range, with_rounding
 from mn_onnx.extract.kernels.slice_points import (
     ABOVE,
     ALL_SLICES,
@@ -61,36 +59,19 @@ from mn_onnx.extract.kernels.slice_points import (
 
 
 @njit(cache=True, error_model="numpy")
-def with_rounding(c0, c1, c2, c3, radius, extent):
-    """A radius with what rounding may add."""
-    one = splat_wide(1.0)
-    size = fma(one, magnitude(c0), fma(one, magnitude(c1), fma(one, magnitude(c2), fma(one, magnitude(c3), radius))))
-    return fma(size, splat_wide(MARGIN * extent), radius)
-
-
-@njit(cache=True, error_model="numpy")
 def relax_simple(F, K, M, table, rows, r, first, last, low, high):
     """Slopes, offsets and errors of a unit of one knot and one output, from its range in each slice.
 
     Sets K[ABOVE] and K[UNDER] of its row.
     """
-    zero, half, minus = splat_wide(0.0), splat_wide(0.5), splat_wide(-1.0)
     knot = splat_wide(F[table + r])
     left, left_at = splat_wide(F[table + rows + r]), splat_wide(F[table + 2 * rows + r])
     right, right_at = splat_wide(F[table + 3 * rows + r]), splat_wide(F[table + 4 * rows + r])
     above, under = at_least(low, knot), is_below(high, knot)
     if first == last:
         above, under = mask_of(ALL_SLICES * first), mask_of(ALL_SLICES * (1 - first))
-    at_low = fma(left, low, left_at)
-    chord = divide(fma(minus, at_low, fma(right, high, right_at)), fma(minus, low, high))
-    deviation = fma(minus, at_low, fma(left, knot, left_at))
-    deviation = fma(fma(minus, low, knot), fma(minus, chord, zero), deviation)
-    middle = fma(half, deviation, fma(fma(minus, chord, zero), low, at_low))
-    slope = choose(above, right, choose(under, left, chord))
-    offset = choose(above, right_at, choose(under, left_at, middle))
-    error = choose(either(above, under), zero, fma(half, magnitude(deviation), zero))
     K[ABOVE * M + r], K[UNDER * M + r] = bits_of(above), bits_of(under)
-    return slope, offset, error
+    return relax_one_knot(knot, left, left_at, right, right_at, low, high, above, under)
 
 
 @njit(cache=True, error_model="numpy")
