@@ -8,6 +8,7 @@ import numpy as np
 
 from mn_onnx.extract.blocks import index_dtype, resolve_threads
 from mn_onnx.extract.invariants import check_invariants
+from mn_onnx.extract.kernels.ahead import compile_ahead
 from mn_onnx.extract.sampling import sample_surface
 from mn_onnx.extract.schedule import traverse
 from mn_onnx.extract.soup import PolygonSoup
@@ -23,7 +24,8 @@ def warm_up(threads: int | None = None) -> Surface:
     """The octahedron |x| + |y| + |z| = 1 / 2; making it goes once through every kernel that extraction and checks need.
 
     Curves and roots need the same ones, as they are extracted in three dimensions. With two of ``threads`` (None: all
-    cores) or more, a second process compiles the kernels for meshes, if need be, while this one compiles the others.
+    cores) or more, a second process compiles the kernels for meshes and some of the traversal's, if need be, while this
+    one compiles the others.
     """
     with compiling_beside(__name__) if resolve_threads(threads) > 1 else nullcontext():
         soup, _ = traverse(_octahedral_network(), -np.ones(DIMENSION), np.ones(DIMENSION), threads=1)
@@ -70,6 +72,7 @@ def _meshed(soup: PolygonSoup) -> Surface:
 
 
 if __name__ == "__main__":
-    # The second process. It compiles no kernel that the traversal has too: were both to write one to the cache at the
-    # same time, for different types, numba would give both files one name.
+    # The second process: first the kernels that the traversal needs last, then those for meshes. What both compile must
+    # be for the same types: written to the cache at the same time for different ones, numba gives both files one name.
+    compile_ahead()
     _meshed(_octahedral_soup())

@@ -81,7 +81,7 @@ def row_extremes(F, N, X, M, cell, begin, end):
         row_extremes_lanes(splat(0.0), F, N, X, M, cell, r)
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", inline="always")
 def row_extremes_lanes(like, F, N, X, M, cell, r):
     """`row_extremes` for as many rows from ``r`` on as ``like`` has lanes."""
     n, x, capacity = N[cell + CELL_VERTICES], N[cell + CELL_FLOATS], N[cell + CELL_CAPACITY]
@@ -153,7 +153,7 @@ def read_outputs(F, X, J, M, floats, rows, begin, end, first, count):
         read_outputs_lanes(splat(0.0), F, X, J, M, floats, rows, r, first, count)
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", inline="always")
 def read_outputs_lanes(like, F, X, J, M, floats, rows, r, first, count):
     """`read_outputs` for as many rows from ``r`` on as ``like`` has lanes."""
     outputs, places = OUTPUTS * M, READ_AT * M

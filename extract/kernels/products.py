@@ -70,7 +70,7 @@ def accumulate_tile(F, t0, targets, rows, source, count, at, stride):
     store(F, t3 + 8, b3)
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", inline="always")
 def accumulate_lanes(like, F, t0, targets, rows, source, count, at, stride):
     """`accumulate_tile` for as many ``q`` as ``like`` has lanes."""
     one, two, three = min(1, targets - 1), min(2, targets - 1), min(3, targets - 1)
