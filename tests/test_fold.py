@@ -40,7 +40,7 @@ def _bound_and_fold(F, N, X, J, tables, cell, folded, folded_floats, least, larg
     bounds = bound_units(f, n, x, j, M, knots, cell, 0, 0, folded_floats, True, large)
     fold(f, n, x, j, M, 0, 0, folded, folded_floats, least)
     carry_states(n, j, M, knots, 0, folded, least)
-    return bounds
+    return bounds[:3]
 
 
 def _fold(

@@ -91,7 +91,7 @@ def _load_states(N: Any, J: Any, root: int) -> None:
 def _bound_cell(F: Any, N: Any, X: Any, J: Any, tables: Any, root: int, cell: int) -> tuple[float, float, float]:
     _load_states(N, J, root)
     bound_units(F, N, X, J, M, tables, cell, 0, 0, 0, False, False)
-    low, high, slack = bound_output(F, N, X, M, tables.extent, cell, 0, 0)
+    low, high, slack = bound_output(F, N, X, M, tables.extent, cell, 0, 0, -1.0)
     return low, high, slack
 
 

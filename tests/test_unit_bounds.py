@@ -12,12 +12,13 @@ from numba import njit
 from numpy.typing import NDArray
 
 from mn_onnx.extract import schedule
-from mn_onnx.extract.kernels.bound import bound_units
+from mn_onnx.extract.kernels.bound import bound_output_form, bound_units
 from mn_onnx.extract.kernels.error_symbols import tracking_floats
 from mn_onnx.extract.kernels.lanes import pointer
 from mn_onnx.extract.kernels.march import point_at_tables
 from mn_onnx.extract.kernels.memory import (
     CELL_HEADER,
+    CENTRE_AT,
     HIGH,
     J_REGIONS,
     LOW,
@@ -40,23 +41,35 @@ LOWER, UPPER = np.array([0.1, -0.3, 0.2]), np.array([0.3, -0.1, 0.4])
 
 
 @njit  # type: ignore[untyped-decorator]
-def _bound(F: Any, N: Any, X: Any, J: Any, tables: Any, cell: int, scratch: int, tracked: bool) -> None:
+def _bound(F: Any, N: Any, X: Any, J: Any, tables: Any, cell: int, scratch: int, tracked: bool) -> float:
     M = X.size // X_REGIONS
     rows = N[SYS_ROWS]
     for r in range(rows):
         J[STATE_LOW * M + r] = N[cell + CELL_HEADER + r]
         J[STATE_HIGH * M + r] = N[cell + CELL_HEADER + rows + r]
-    bound_units(
+    _, _, _, radius = bound_units(
         pointer(F), pointer(N), pointer(X), pointer(J), M, point_at_tables(tables), cell, 0, 0, scratch, tracked, False
     )
+    return radius
+
+
+@njit  # type: ignore[untyped-decorator]
+def _bound_backwards(F: Any, N: Any, X: Any) -> float:
+    return bound_output_form(pointer(F), pointer(N), pointer(X), X.size // X_REGIONS, 0, 0)
+
+
+def _bounded(packed: Packed, tracked: bool) -> tuple[Floats, Floats, int, float]:
+    """F and X after the pass, the size of X's regions, and the output's radius if it has been tracked."""
+    room = max(packed.rows, symbol_stride(packed.cols)) + 8
+    X, J = np.zeros(X_REGIONS * room), np.zeros(J_REGIONS * room, np.int64)
+    F = np.concatenate([packed.F, np.zeros(tracking_floats(packed.rows, packed.cols))])
+    radius = _bound(F, packed.N, X, J, packed.tables, packed.root, packed.F.size, tracked)
+    return F, X, room, radius
 
 
 def _radii(packed: Packed, tracked: bool) -> tuple[Floats, Floats, Floats]:
     """Lowest and highest centre and the radius of every unit, in the packed order."""
-    room = max(packed.rows, symbol_stride(packed.cols)) + 8
-    X, J = np.zeros(X_REGIONS * room), np.zeros(J_REGIONS * room, np.int64)
-    F = np.concatenate([packed.F, np.zeros(tracking_floats(packed.rows, packed.cols))])
-    _bound(F, packed.N, X, J, packed.tables, packed.root, packed.F.size, tracked)
+    _, X, room, _ = _bounded(packed, tracked)
     row_unit = packed.N[SYS_HEADER + packed.levels + 1 :][: packed.rows]
     rows = np.flatnonzero(row_unit >= 0)
     low, high, radius = (X[region * room :][rows] for region in (LOW, HIGH, RADIUS))
@@ -116,6 +129,26 @@ def test_tracked_errors_are_those_of_zonotopes_but_for_rounding(layers: list[int
     _, _, summed = _radii(packed, False)
     assert np.all(tracked >= expected * (1.0 - 1e-9))
     assert np.all(tracked <= expected + 1e-3 * summed)
+
+
+@pytest.mark.parametrize(
+    "network",
+    [
+        dense([12] * 6, seed=8),
+        dense([40, 33, 50, 7, 45, 41], seed=8),
+        random_tables(3, (3, 3, 3, 3, 2), n_knots=4, n_outputs=3),
+    ],
+    ids=["narrow", "wide", "several outputs"],
+)
+def test_a_tracked_output_is_what_a_backward_pass_gives(network: Network) -> None:
+    packed = pack(canonicalize(network, lower=LOWER, upper=UPPER).network, LOWER, UPPER)
+    F, X, room, radius = _bounded(packed, True)
+    centre = X[CENTRE_AT * room :][:4].copy()
+    expected = _bound_backwards(F, packed.N, X)
+    assert expected > 0.0
+    assert X[CENTRE_AT * room :][:4] == pytest.approx(centre, rel=1e-12)
+    assert expected * (1.0 - 1e-9) <= radius <= expected * 1.01
+    assert _bounded(packed, False)[-1] == -1.0
 
 
 @pytest.mark.parametrize("power", [-100, -50, 50, 140])

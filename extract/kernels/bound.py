@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from mn_onnx.extract.kernels.error_symbols import pass_errors_on, track_errors
+from mn_onnx.extract.kernels.error_symbols import number_errors, track_errors, track_output
 from mn_onnx.extract.kernels.lanes import (
     fma,
     halves,
@@ -201,8 +201,9 @@ def bound_units(F, N, X, J, M, tables, cell, system, floats, scratch, tracked, l
 
     Reads the row states in J (STATE_LOW, STATE_HIGH) and narrows them, and sets the rows' KIND. If ``tracked``, radii
     come from `error_symbols`, whose tables begin at F[scratch]. Returns the numbers of settled rows whose output is not
-    identically zero (LINEAR), and whose is (DEAD), and whether all levels are bounded: in ``large`` cells not if hardly
-    any unit of an earlier one settles.
+    identically zero (LINEAR), and whose is (DEAD), whether all levels are bounded: in ``large`` cells not if hardly
+    any unit of an earlier one settles; and the radius of the output around the centre in X[CENTRE_AT] if it has been
+    tracked, else -1.
     """
     rows, cols, levels = N[system + SYS_ROWS], N[system + SYS_COLS], N[system + SYS_LEVELS]
     level_start = system + SYS_HEADER
@@ -212,8 +213,8 @@ def bound_units(F, N, X, J, M, tables, cell, system, floats, scratch, tracked, l
     weights = weights_of(floats, rows)
     stride = symbol_stride(cols)
     errors = 2 * aligned(scratch)  # in float32
-    carried = errors + rows * stride
-    read = carried + cols * stride
+    own = errors + rows * stride
+    read = own + 4 * stride
     J[LEVEL_OUTPUT * M] = J[LEVEL_SYMBOL * M] = 0
     first, count, linear, dead = np.int64(0), np.int64(0), 0, 0
     rounding = 0.0
@@ -225,7 +226,7 @@ def bound_units(F, N, X, J, M, tables, cell, system, floats, scratch, tracked, l
         read_outputs(F, X, J, M, floats, rows, begin, end, first, count)
         if tracked:
             rounding = track_errors(
-                F, X, J, M, weights, begin, end, level, first, count, errors, carried, stride, read, rounding
+                F, X, J, M, weights, begin, end, level, first, count, errors, stride, read, rounding
             )
         else:
             for r in range(begin, end, 4):
@@ -241,10 +242,15 @@ def bound_units(F, N, X, J, M, tables, cell, system, floats, scratch, tracked, l
             settled = new_linear + new_dead
             if LEAST_SETTLED * settled < count_units(N, row_unit, begin, end):
                 leave_unbounded(N, X, J, M, row_col, rows, end)
-                return linear, dead, False
+                return linear, dead, False, -1.0
         if tracked:
-            tracked = pass_errors_on(F, X, J, M, level, before, count, errors, carried, stride)
-    return linear, dead, True
+            tracked = number_errors(X, J, M, level, before, count)
+    radius = -1.0
+    if tracked:
+        out_weights = weights + cols * rows
+        constants = out_weights + padded(cols)
+        radius = track_output(F, X, J, M, out_weights, constants, levels, count, errors, own, stride, read, rounding)
+    return linear, dead, True, radius
 
 
 @njit(cache=True, error_model="numpy")
@@ -366,12 +372,13 @@ def bound_output_form(F, N, X, M, system, floats):
 
 
 @njit(cache=True, error_model="numpy")
-def bound_output(F, N, X, M, extent, cell, system, floats):
+def bound_output(F, N, X, M, extent, cell, system, floats, radius):
     """The output over the cell, after `bound_units`: the range of its linear centre, and how far it may be from that.
 
     The centre is in X[CENTRE_AT] (four numbers), its values at the cell's vertices in X[OUT_VALUES].
     """
-    radius = bound_output_form(F, N, X, M, system, floats)
+    if radius < 0.0:
+        radius = bound_output_form(F, N, X, M, system, floats)
     at = CENTRE_AT * M
     evaluate_affine(F, N, X, M, cell, OUT_VALUES, X[at], X[at + 1], X[at + 2], X[at + 3])
     low, high = value_range(X, M, OUT_VALUES, N[cell + CELL_CAPACITY])

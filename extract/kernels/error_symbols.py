@@ -6,7 +6,11 @@ hundred times what this gives. The same forms are in Singh et al., Fast and Effe
 before it, and its radius is the sum of their magnitudes. The cost is the cube of the number of units, so this is for
 deep systems only, and not for every cell.
 
-The tables are float32, and the radius is enlarged by the most that their rounding can have taken away: the magnitudes
+A row's coefficients are, for the symbols of outputs that it reads, their errors times its weights, and what the rows of
+these outputs have for the symbols before them, times weights and slopes. So the table has rows of pre-activations only.
+The network's output is one more row: that is what a backward pass over the same chords gives.
+
+The table is float32, and the radius is enlarged by the most that their rounding can have taken away: the magnitudes
 of all that is summed add up to no more than X[GROWTH], so n roundings in a row take at most n halves of a unit in the
 last place of that (Higham, Accuracy and Stability of Numerical Algorithms, section 3.1).
 """
@@ -19,24 +23,33 @@ from numba import njit
 from mn_onnx.extract.kernels.lanes import (
     as_singles,
     fma,
-    load,
     load_singles,
+    load_wide,
     magnitude,
     round_to_singles,
     splat_singles,
+    splat_wide,
     store,
+    store_transposed,
     total,
 )
 from mn_onnx.extract.kernels.memory import (
+    CENTRE_AT,
     ERROR,
     GROWTH,
     LEVEL_OUTPUT,
     LEVEL_SYMBOL,
+    OUT_COEF,
+    OUTPUTS,
     RADIUS,
     READ_AT,
     READ_COLS,
     READ_ROW,
+    READ_SLOPE,
+    READ_SYMBOL,
     SLOPE,
+    SYMBOL_AT,
+    SYMBOL_ERROR,
     symbol_stride,
 )
 from mn_onnx.extract.kernels.relax import MARGIN
@@ -45,122 +58,227 @@ from mn_onnx.extract.kernels.relax import MARGIN
 ROUNDING = 1.05 * 2.0**-24
 # Errors are tracked as long as all of them add up to numbers in this range: there float32 is far from both its ends.
 SMALLEST, LARGEST = 2.0**-40, 2.0**40
-# So many outputs of a tile stay in the nearest cache.
+# What float32 can lose of a radius at its lower end.
+TINY = 2.0**-90
+# So many rows of a tile stay in the nearest cache.
 PANEL = 192
 
 
 @njit(cache=True, error_model="numpy")
-def add_tile(E, target, stride, gathered, count, weights, fresh):
-    """32 symbols of four rows: what the rows read of ``count`` outputs, added to E[target] unless ``fresh``.
+def add_tile(E, J, target, stride, table, read, count, weights):
+    """Add 16 symbols of what eight rows read of ``count`` rows before them to E[target].
 
-    ``gathered``: the first output's entry of the first symbol; ``weights``: four for each output.
+    ``table``: the first symbol's entry of row 0; ``read``: J's index of the rows read; ``weights``: eight for each.
     """
     t1, t2, t3 = target + stride, target + 2 * stride, target + 3 * stride
-    zero = splat_singles(np.float32(0.0))
-    a0, a1, a2, a3 = zero, zero, zero, zero
-    b0, b1, b2, b3 = zero, zero, zero, zero
-    if not fresh:
-        a0, a1, a2, a3 = load_singles(E, target), load_singles(E, t1), load_singles(E, t2), load_singles(E, t3)
-        b0, b1 = load_singles(E, target + 16), load_singles(E, t1 + 16)
-        b2, b3 = load_singles(E, t2 + 16), load_singles(E, t3 + 16)
-    for _ in range(count):
-        u, v = load_singles(E, gathered), load_singles(E, gathered + 16)
-        w0, w1 = splat_singles(E[weights]), splat_singles(E[weights + 1])
-        w2, w3 = splat_singles(E[weights + 2]), splat_singles(E[weights + 3])
-        a0, b0 = fma(w0, u, a0), fma(w0, v, b0)
-        a1, b1 = fma(w1, u, a1), fma(w1, v, b1)
-        a2, b2 = fma(w2, u, a2), fma(w2, v, b2)
-        a3, b3 = fma(w3, u, a3), fma(w3, v, b3)
-        gathered += stride
-        weights += 4
+    t4, t5, t6, t7 = target + 4 * stride, t1 + 4 * stride, t2 + 4 * stride, t3 + 4 * stride
+    a0, a1, a2, a3 = load_singles(E, target), load_singles(E, t1), load_singles(E, t2), load_singles(E, t3)
+    a4, a5, a6, a7 = load_singles(E, t4), load_singles(E, t5), load_singles(E, t6), load_singles(E, t7)
+    for p in range(count):
+        u = load_singles(E, table + J[read + p] * stride)
+        a0 = fma(splat_singles(E[weights]), u, a0)
+        a1 = fma(splat_singles(E[weights + 1]), u, a1)
+        a2 = fma(splat_singles(E[weights + 2]), u, a2)
+        a3 = fma(splat_singles(E[weights + 3]), u, a3)
+        a4 = fma(splat_singles(E[weights + 4]), u, a4)
+        a5 = fma(splat_singles(E[weights + 5]), u, a5)
+        a6 = fma(splat_singles(E[weights + 6]), u, a6)
+        a7 = fma(splat_singles(E[weights + 7]), u, a7)
+        weights += 8
     store(E, target, a0)
     store(E, t1, a1)
     store(E, t2, a2)
     store(E, t3, a3)
-    store(E, target + 16, b0)
-    store(E, t1 + 16, b1)
-    store(E, t2 + 16, b2)
-    store(E, t3 + 16, b3)
+    store(E, t4, a4)
+    store(E, t5, a5)
+    store(E, t6, a6)
+    store(E, t7, a7)
 
 
 @njit(cache=True, error_model="numpy")
-def sum_errors(E, X, M, row, target, symbols, rounding):
-    """X[RADIUS] of a row: the sum of its errors' magnitudes, with their rounding, at most X[GROWTH]."""
+def gather_weights(F, E, X, J, M, weights, begin, end, first, count, read):
+    """The weights that rows ``begin:end`` have for the rows of the outputs ``first:count``, at E[read].
+
+    Eight rows after eight, and in each eight for every output; weights and slopes are multiplied.
+    """
+    outputs, zero = count - first, splat_wide(0.0)
+    for p in range(first, count):
+        column, slope = weights + J[READ_AT * M + p], splat_wide(X[READ_SLOPE * M + p])
+        block = read + 8 * (p - first)
+        for r in range(begin, end, 8):
+            store(E, block, round_to_singles(fma(load_wide(F, column + r), slope, zero)))
+            block += 8 * outputs
+
+
+@njit(cache=True, error_model="numpy")
+def begin_rows(F, E, X, J, M, weights, begin, end, known, symbols, errors, stride):
+    """Rows ``begin:end`` of the table: what they read of the own errors ``known:symbols`` of outputs, else zero."""
+    nothing, zero = splat_singles(np.float32(0.0)), splat_wide(0.0)
+    for row in range(errors + begin * stride, errors + end * stride, stride):
+        for q in range(0, known, 16):
+            store(E, row + q, nothing)
+        for q in range(symbols, (symbols + 15) & ~15, 16):
+            store(E, row + q, nothing)
+    for s in range(known, symbols, 4):
+        at, own = SYMBOL_AT * M + s, SYMBOL_ERROR * M + s
+        a, b, c, d = weights + J[at], weights + J[at + 1], weights + J[at + 2], weights + J[at + 3]
+        e, f, g, h = splat_wide(X[own]), splat_wide(X[own + 1]), splat_wide(X[own + 2]), splat_wide(X[own + 3])
+        target = errors + begin * stride + s
+        for r in range(begin, end, 8):
+            store_transposed(
+                E,
+                target,
+                stride,
+                round_to_singles(fma(load_wide(F, a + r), e, zero)),
+                round_to_singles(fma(load_wide(F, b + r), f, zero)),
+                round_to_singles(fma(load_wide(F, c + r), g, zero)),
+                round_to_singles(fma(load_wide(F, d + r), h, zero)),
+            )
+            target += 8 * stride
+
+
+@njit(cache=True, error_model="numpy")
+def summed_errors(E, target, symbols, growth, rounding):
+    """The sum of a row's errors' magnitudes, with their rounding: at most ``growth``."""
     one, summed = splat_singles(np.float32(1.0)), splat_singles(np.float32(0.0))
     for s in range(0, symbols, 16):
         summed = fma(one, magnitude(load_singles(E, target + s)), summed)
-    growth = X[GROWTH * M + row]
-    radius = total(summed) + (rounding + MARGIN) * growth
-    X[RADIUS * M + row] = radius if radius < growth else growth
+    radius = total(summed) + (rounding + MARGIN) * growth + TINY
+    return radius if radius < growth else growth
 
 
 @njit(cache=True, error_model="numpy")
-def track_errors(F, X, J, M, weights, begin, end, level, first, count, errors, carried, stride, read, rounding):
+def track_errors(F, X, J, M, weights, begin, end, level, first, count, errors, stride, read, rounding):
     """Radii of rows ``begin:end`` of a level from the error of every single unit before.
 
-    ``weights``: F's index of the columns. ``first:count``: the outputs that the rows read. In F as float32, the rows'
-    table of errors starts at ``errors``, the outputs' at ``carried``, ``stride`` numbers for each row or output;
-    ``read`` is scratch of a number for each row and output. ``rounding``: how many roundings a number of the outputs'
-    table may have had, as a share of X[GROWTH]; returns the same of the rows'.
+    ``weights``: F's index of the columns. ``first:count``: the outputs that the rows read. In F as float32, the table
+    of errors starts at ``errors``, ``stride`` numbers for each row; ``read`` is scratch of a number for each row and
+    output. ``rounding``: how many roundings a number of the table may have had, as a share of X[GROWTH]; returns the
+    same with these rows.
     """
     E = as_singles(F)
     symbols, outputs = J[LEVEL_SYMBOL * M + level], count - first
-    for r in range(begin, end, 4):
-        block = read + (r - begin) * outputs
-        for p in range(first, count):
-            store(E, block, round_to_singles(load(F, weights + J[READ_AT * M + p] + r)))
-            block += 4
+    known = J[READ_SYMBOL * M + first] if first < count else symbols
+    gather_weights(F, E, X, J, M, weights, begin, end, first, count, read)
+    begin_rows(F, E, X, J, M, weights, begin, end, known, symbols, errors, stride)
     earlier = 0
-    for q in range(0, symbols, 32):
-        # Outputs of levels before the tile's first symbol have no error of it.
+    for q in range(0, symbols, 16):
+        # Errors of the tile's first level reach rows of later levels only.
         while J[LEVEL_SYMBOL * M + earlier + 1] <= q:
             earlier += 1
-        since = max(first, J[LEVEL_OUTPUT * M + earlier])
-        p = since
-        while p == since or p < count:
+        p = max(first, J[LEVEL_OUTPUT * M + earlier + 1])
+        while p < count:
             n = min(PANEL, count - p)
-            for r in range(begin, end, 4):
-                at = read + (r - begin) * outputs + 4 * (p - first)
-                add_tile(E, errors + r * stride + q, stride, carried + p * stride + q, n, at, p == since)
+            for r in range(begin, end, 8):
+                at = read + (r - begin) * outputs + 8 * (p - first)
+                add_tile(E, J, errors + r * stride + q, stride, errors + q, READ_ROW * M + p, n, at)
             p += PANEL
     rounding += ROUNDING * (outputs + (symbols >> 4) + 16)
     for r in range(begin, end):
-        sum_errors(E, X, M, r, errors + r * stride, symbols, rounding)
+        X[RADIUS * M + r] = summed_errors(E, errors + r * stride, symbols, X[GROWTH * M + r], rounding)
     return rounding
 
 
 @njit(cache=True, error_model="numpy")
-def pass_errors_on(F, X, J, M, level, begin, end, errors, carried, stride):
-    """The table of errors of outputs ``begin:end`` of a level, and a symbol for each that has an error of its own.
+def number_errors(X, J, M, level, begin, end):
+    """A symbol for each of the outputs ``begin:end`` of a level that has an error of its own.
 
     Returns whether all errors are of a size for float32.
     """
-    E = as_singles(F)
-    known = J[LEVEL_SYMBOL * M + level]
-    symbols, fit = known, True
+    symbols, fit = J[LEVEL_SYMBOL * M + level], True
     for p in range(begin, end):
-        symbols += X[ERROR * M + J[READ_COLS * M + p]] > 0.0
+        c = J[READ_COLS * M + p]
+        X[READ_SLOPE * M + p] = X[SLOPE * M + c]
+        J[READ_SYMBOL * M + p] = symbols
+        X[SYMBOL_ERROR * M + symbols] = X[ERROR * M + c]
+        J[SYMBOL_AT * M + symbols] = J[READ_AT * M + p]
+        symbols += X[ERROR * M + c] > 0.0
+        growth = X[(OUTPUTS + 4) * M + p]
+        fit &= (growth == 0.0) | ((growth > SMALLEST) & (growth < LARGEST))
+        fit &= X[GROWTH * M + J[READ_ROW * M + p]] < LARGEST
+    for s in range(symbols, symbols + 4):  # read, but of no output
+        X[SYMBOL_ERROR * M + s] = 0.0
+        J[SYMBOL_AT * M + s] = 0
     J[LEVEL_OUTPUT * M + level + 1] = end
     J[LEVEL_SYMBOL * M + level + 1] = symbols
-    zero, symbol = splat_singles(np.float32(0.0)), known
-    for p in range(begin, end):
-        c, r = J[READ_COLS * M + p], J[READ_ROW * M + p]
-        slope = splat_singles(np.float32(X[SLOPE * M + c]))
-        source, target = errors + r * stride, carried + p * stride
-        for s in range(0, known, 16):
-            store(E, target + s, fma(slope, load_singles(E, source + s), zero))
-        for s in range((known + 15) & ~15, (symbols + 31) & ~31, 16):
-            store(E, target + s, zero)
-        error = X[ERROR * M + c]
-        growth = abs(X[SLOPE * M + c]) * X[GROWTH * M + r] + error
-        fit &= (growth == 0.0) | ((growth > SMALLEST) & (growth < LARGEST))
-        if error > 0.0:
-            E[target + symbol] = np.float32(error)
-            symbol += 1
     return fit
 
 
 @njit(cache=True, error_model="numpy")
+def add_four(E, J, target, symbols, errors, stride, read, count, weights):
+    """Add ``symbols`` errors of four rows, or of ``count`` if that is less, weighted, to E[target].
+
+    ``errors``: the table; ``read``: J's index of the rows.
+    """
+    none = np.float32(0.0)
+    last = count - 1
+    s0, s1 = errors + J[read] * stride, errors + J[read + min(1, last)] * stride
+    s2, s3 = errors + J[read + min(2, last)] * stride, errors + J[read + last] * stride
+    w0, w1 = splat_singles(E[weights]), splat_singles(E[weights + 1] if count > 1 else none)
+    w2 = splat_singles(E[weights + 2] if count > 2 else none)
+    w3 = splat_singles(E[weights + 3] if count > 3 else none)
+    for q in range(0, symbols, 16):
+        a = fma(w0, load_singles(E, s0 + q), load_singles(E, target + q))
+        a = fma(w1, load_singles(E, s1 + q), a)
+        a = fma(w2, load_singles(E, s2 + q), a)
+        a = fma(w3, load_singles(E, s3 + q), a)
+        store(E, target + q, a)
+
+
+@njit(cache=True, error_model="numpy")
+def centre_output(F, X, J, M, out_weights, constants, count):
+    """The output's linear centre over ``count`` outputs of units, X[CENTRE_AT] (four numbers); returns its growth.
+
+    ``out_weights``: F's index of the columns' weights in the output; ``constants``: of its affine part. Leaves the
+    weights of the outputs in X[OUT_COEF].
+    """
+    for p in range(count):
+        X[OUT_COEF * M + p] = F[out_weights + J[READ_COLS * M + p]]
+    c0, c1, c2, c3, growth = splat_wide(0.0), splat_wide(0.0), splat_wide(0.0), splat_wide(0.0), splat_wide(0.0)
+    for p in range(0, count - 7, 8):
+        weight, y = load_wide(X, OUT_COEF * M + p), OUTPUTS * M + p
+        c0 = fma(weight, load_wide(X, y), c0)
+        c1 = fma(weight, load_wide(X, y + M), c1)
+        c2 = fma(weight, load_wide(X, y + 2 * M), c2)
+        c3 = fma(weight, load_wide(X, y + 3 * M), c3)
+        growth = fma(magnitude(weight), load_wide(X, y + 4 * M), growth)
+    at = CENTRE_AT * M
+    X[at], X[at + 1] = F[constants] + total(c0), F[constants + 1] + total(c1)
+    X[at + 2], X[at + 3] = F[constants + 2] + total(c2), F[constants + 3] + total(c3)
+    most = total(growth)
+    for p in range(count & ~7, count):
+        weight, y = X[OUT_COEF * M + p], OUTPUTS * M + p
+        for k in range(4):
+            X[at + k] += weight * X[y + k * M]
+        most += abs(weight) * X[y + 4 * M]
+    return most
+
+
+@njit(cache=True, error_model="numpy")
+def track_output(F, X, J, M, out_weights, constants, levels, count, errors, own, stride, read, rounding):
+    """The output's linear centre (X[CENTRE_AT], four numbers) and its radius, which is returned.
+
+    After all ``levels``; ``own``: scratch of ``stride`` numbers. The others as for `track_errors` and `centre_output`.
+    """
+    E = as_singles(F)
+    growth = centre_output(F, X, J, M, out_weights, constants, count)
+    symbols = J[LEVEL_SYMBOL * M + levels]
+    for q in range(symbols & ~15, symbols, 16):
+        store(E, own + q, splat_singles(np.float32(0.0)))
+    for p in range(count):
+        weight, symbol = X[OUT_COEF * M + p], J[READ_SYMBOL * M + p]
+        E[read + p] = np.float32(weight * X[READ_SLOPE * M + p])
+        E[own + symbol] = np.float32(weight * X[SYMBOL_ERROR * M + symbol])
+    for level in range(1, levels):
+        known = J[LEVEL_SYMBOL * M + level]
+        end = J[LEVEL_OUTPUT * M + level + 1]
+        for p in range(J[LEVEL_OUTPUT * M + level], end, 4):
+            add_four(E, J, own, known, errors, stride, READ_ROW * M + p, min(4, end - p), read + p)
+    rounding += ROUNDING * (count + (symbols >> 4) + 16)
+    return summed_errors(E, own, symbols, growth, rounding)
+
+
+@njit(cache=True, error_model="numpy")
 def tracking_floats(rows, cols):
-    """Number of float64 that the tables of errors of a system take in scratch."""
-    return ((rows + cols) * symbol_stride(cols) + rows * cols) // 2 + 24
+    """Number of float64 that the table of errors of a system takes in scratch."""
+    return (rows + 4) * (symbol_stride(cols) + cols) // 2 + 24

@@ -33,7 +33,7 @@ class LanesType(types.Type):
 
 lanes = LanesType(WIDTH, ir.DoubleType())
 wide_lanes = LanesType(WIDE, ir.DoubleType())
-four_singles = LanesType(WIDTH, ir.FloatType())
+wide_singles = LanesType(WIDE, ir.FloatType())
 singles = LanesType(SINGLES, ir.FloatType())
 
 
@@ -101,12 +101,12 @@ def splat_singles(typing_context: Any, value: Any) -> Any:
 
 @intrinsic
 def round_to_singles(typing_context: Any, values: Any) -> Any:
-    """Four float64 rounded to float32."""
+    """Eight float64 rounded to float32."""
 
     def code(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        return builder.fptrunc(arguments[0], four_singles.vector)
+        return builder.fptrunc(arguments[0], wide_singles.vector)
 
-    return four_singles(lanes), code
+    return wide_singles(wide_lanes), code
 
 
 @intrinsic
@@ -147,6 +147,33 @@ def store(typing_context: Any, target: Any, index: Any, value: Any) -> Any:
         return context.get_dummy_value()
 
     return types.none(target, types.int64, value), code
+
+
+@intrinsic
+def store_transposed(typing_context: Any, target: Any, index: Any, stride: Any, a: Any, b: Any, c: Any, d: Any) -> Any:
+    """Lane ``k`` of four `wide_singles`, one after the other, to ``target[index + k * stride]``, through a pointer."""
+
+    def code(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        target, index, stride, *columns = arguments
+
+        def shuffle(left: Any, right: Any, order: list[int]) -> Any:
+            return builder.shuffle_vector(left, right, ir.Constant(ir.VectorType(_INT32, len(order)), order))
+
+        rows = []
+        for k in (0, 2):
+            # In both halves of a register: lanes k and k + 1 of two columns by turns, then of four.
+            turns = [k + lane + column for lane in (0, 1, 4, 5) for column in (0, WIDE)]
+            left, right = shuffle(*columns[:2], turns), shuffle(*columns[2:], turns)
+            fours = ([j + lane for lane in (0, 1, 8, 9, 4, 5, 12, 13)] for j in (0, 2))
+            rows.extend(shuffle(left, right, order) for order in fours)
+        for half in ([0, 1, 2, 3], [4, 5, 6, 7]):
+            for row in rows:
+                part = shuffle(row, row, half)
+                builder.store(part, _vector_pointer(builder, part.type, target, index), align=4)
+                index = builder.add(index, stride)
+        return context.get_dummy_value()
+
+    return types.none(target, types.int64, types.int64, a, b, c, d), code
 
 
 @intrinsic

@@ -233,12 +233,14 @@ def visit(F, N, X, J, M, control, stack, output, tables, S, K, slot_of_tag, cell
             split_cell(F, N, X, J, M, control, stack, tables, slot_of_tag, cell, rows, system, floats, row, row, knot)
             return
     tracked = how != SUMMED
-    linear, dead, bounded = bound_units(F, N, X, J, M, tables, cell, system, floats, control[TOP_F], tracked, large)
+    linear, dead, bounded, radius = bound_units(
+        F, N, X, J, M, tables, cell, system, floats, control[TOP_F], tracked, large
+    )
     leaf = is_leaf(N, J, M, control, system)
     whole = cell
     loose = False
     if bounded:
-        low, high, slack = bound_output(F, N, X, M, tables.extent, cell, system, floats)
+        low, high, slack = bound_output(F, N, X, M, tables.extent, cell, system, floats, radius)
         if low > slack or high < -slack:
             control[PRUNED] += 1
             return
