@@ -266,6 +266,7 @@ def track_output(F, X, J, M, out_weights, constants, levels, count, errors, own,
     for q in range(symbols & ~15, symbols, 16):
         store(E, own + q, splat_singles(np.float32(0.0)))
     for p in range(count):
+        # What an output without an error of its own writes, the next one that has one writes over.
         weight, symbol = X[OUT_COEF * M + p], J[READ_SYMBOL * M + p]
         E[read + p] = np.float32(weight * X[READ_SLOPE * M + p])
         E[own + symbol] = np.float32(weight * X[SYMBOL_ERROR * M + symbol])
