@@ -17,7 +17,7 @@ from mn_onnx.extract.kernels.error_symbols import tracking_floats
 from mn_onnx.extract.kernels.fold import fold, folding_floats
 from mn_onnx.extract.kernels.lanes import pointer
 from mn_onnx.extract.kernels.layout import carry_states
-from mn_onnx.extract.kernels.march import point_at_tables
+from mn_onnx.extract.kernels.march import load_states, point_at_tables
 from mn_onnx.extract.kernels.memory import J_REGIONS, LINEAR, UNSTABLE, X_REGIONS
 from mn_onnx.extract.pack import pack
 from mn_onnx.ir.network import AffineRow, Network, Unit
@@ -32,11 +32,8 @@ LOWER, UPPER = np.array([0.1, -0.3, 0.2]), np.array([0.4, 0.0, 0.5])
 @njit
 def _bound_and_fold(F, N, X, J, tables, cell, folded, folded_floats, least, large):
     M = X.size // X_REGIONS
-    rows = N[memory.SYS_ROWS]
     f, n, x, j, knots = pointer(F), pointer(N), pointer(X), pointer(J), point_at_tables(tables)
-    for r in range(rows):
-        J[memory.STATE_LOW * M + r] = N[cell + memory.CELL_HEADER + r]
-        J[memory.STATE_HIGH * M + r] = N[cell + memory.CELL_HEADER + rows + r]
+    load_states(n, j, M, cell, N[memory.SYS_ROWS])
     bounds = bound_units(f, n, x, j, M, knots, cell, 0, 0, folded_floats, True, large)
     fold(f, n, x, j, M, 0, 0, folded, folded_floats, least)
     carry_states(n, j, M, knots, 0, folded, least)

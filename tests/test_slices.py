@@ -14,13 +14,10 @@ from numpy.typing import NDArray
 from mn_onnx.extract.kernels.bound import bound_output, bound_units
 from mn_onnx.extract.kernels.control import CONTROL_SIZE, TOP_F, TOP_I
 from mn_onnx.extract.kernels.lanes import lane, pointer
-from mn_onnx.extract.kernels.march import point_at_tables
+from mn_onnx.extract.kernels.march import load_states, point_at_tables
 from mn_onnx.extract.kernels.memory import (
-    CELL_HEADER,
     CENTRE_AT,
     J_REGIONS,
-    STATE_HIGH,
-    STATE_LOW,
     SYS_HEADER,
     SYS_ROWS,
     TRIMMED_DEPTHS,
@@ -80,16 +77,8 @@ class _Slices(NamedTuple):
 
 
 @njit  # type: ignore[untyped-decorator]
-def _load_states(N: Any, J: Any, root: int) -> None:
-    rows = N[SYS_ROWS]
-    for r in range(rows):
-        J[STATE_LOW * M + r] = N[root + CELL_HEADER + r]
-        J[STATE_HIGH * M + r] = N[root + CELL_HEADER + rows + r]
-
-
-@njit  # type: ignore[untyped-decorator]
 def _bound_cell(F: Any, N: Any, X: Any, J: Any, tables: Any, root: int, cell: int) -> tuple[float, float, float]:
-    _load_states(N, J, root)
+    load_states(N, J, M, root, N[SYS_ROWS])
     bound_units(F, N, X, J, M, tables, cell, 0, 0, 0, False, False)
     low, high, slack = bound_output(F, N, X, M, tables.extent, cell, 0, 0, -1.0)
     return low, high, slack
@@ -120,7 +109,7 @@ def _bound(
     placed = place_points(F, N, X, S, K, M, root, rows, low, thickness)
     _bound_cell(F, N, X, J, tables, root, root)
     # Whatever rows the cell settles, slices are given none of it.
-    _load_states(N, J, root)
+    load_states(N, J, M, root, N[SYS_ROWS])
     count = bound_rows(F, N, S, J, K, M, tables, 0, 0)
     lows, highs, slacks = bound_slice_outputs(F, N, S, K, M, tables.extent, 0, 0, count)
     for k in range(SLICES):

@@ -15,16 +15,13 @@ from mn_onnx.extract import schedule
 from mn_onnx.extract.kernels.bound import bound_output_form, bound_units
 from mn_onnx.extract.kernels.error_symbols import tracking_floats
 from mn_onnx.extract.kernels.lanes import pointer
-from mn_onnx.extract.kernels.march import point_at_tables
+from mn_onnx.extract.kernels.march import load_states, point_at_tables
 from mn_onnx.extract.kernels.memory import (
-    CELL_HEADER,
     CENTRE_AT,
     HIGH,
     J_REGIONS,
     LOW,
     RADIUS,
-    STATE_HIGH,
-    STATE_LOW,
     SYS_HEADER,
     SYS_ROWS,
     X_REGIONS,
@@ -43,13 +40,9 @@ LOWER, UPPER = np.array([0.1, -0.3, 0.2]), np.array([0.3, -0.1, 0.4])
 @njit  # type: ignore[untyped-decorator]
 def _bound(F: Any, N: Any, X: Any, J: Any, tables: Any, cell: int, scratch: int, tracked: bool) -> float:
     M = X.size // X_REGIONS
-    rows = N[SYS_ROWS]
-    for r in range(rows):
-        J[STATE_LOW * M + r] = N[cell + CELL_HEADER + r]
-        J[STATE_HIGH * M + r] = N[cell + CELL_HEADER + rows + r]
-    _, _, _, radius = bound_units(
-        pointer(F), pointer(N), pointer(X), pointer(J), M, point_at_tables(tables), cell, 0, 0, scratch, tracked, False
-    )
+    f, n, x, j = pointer(F), pointer(N), pointer(X), pointer(J)
+    load_states(n, j, M, cell, N[SYS_ROWS])
+    _, _, _, radius = bound_units(f, n, x, j, M, point_at_tables(tables), cell, 0, 0, scratch, tracked, False)
     return radius
 
 

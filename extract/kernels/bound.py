@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from mn_onnx.extract.kernels.error_symbols import number_errors, track_errors, track_output
+from mn_onnx.extract.kernels.error_symbols import ROWS_BEYOND, number_errors, track_errors, track_output
 from mn_onnx.extract.kernels.lanes import (
     fma,
     halves,
@@ -200,7 +200,7 @@ def bound_units(F, N, X, J, M, tables, cell, system, floats, scratch, tracked, l
     """Forward pass: bounds, states and relaxations of all rows of the system over the cell.
 
     Reads the row states in J (STATE_LOW, STATE_HIGH) and narrows them, and sets the rows' KIND. If ``tracked``, radii
-    come from `error_symbols`, whose tables begin at F[scratch]. Returns the numbers of settled rows whose output is not
+    come from `error_symbols`, whose table begins at F[scratch]. Returns the numbers of settled rows whose output is not
     identically zero (LINEAR), and whose is (DEAD), whether all levels are bounded: in ``large`` cells not if hardly
     any unit of an earlier one settles; and the radius of the output around the centre in X[CENTRE_AT] if it has been
     tracked, else -1.
@@ -214,7 +214,7 @@ def bound_units(F, N, X, J, M, tables, cell, system, floats, scratch, tracked, l
     stride = symbol_stride(cols)
     errors = 2 * aligned(scratch)  # in float32
     own = errors + rows * stride
-    read = own + 4 * stride
+    read = own + ROWS_BEYOND * stride
     J[LEVEL_OUTPUT * M] = J[LEVEL_SYMBOL * M] = 0
     first, count, linear, dead = np.int64(0), np.int64(0), 0, 0
     rounding = 0.0

@@ -10,7 +10,7 @@ A row's coefficients are, for the symbols of outputs that it reads, their errors
 these outputs have for the symbols before them, times weights and slopes. So the table has rows of pre-activations only.
 The network's output is one more row: that is what a backward pass over the same chords gives.
 
-The table is float32, and the radius is enlarged by the most that their rounding can have taken away: the magnitudes
+The table is float32, and the radius is enlarged by the most that its rounding can have taken away: the magnitudes
 of all that is summed add up to no more than X[GROWTH], so n roundings in a row take at most n halves of a unit in the
 last place of that (Higham, Accuracy and Stability of Numerical Algorithms, section 3.1).
 """
@@ -60,6 +60,8 @@ ROUNDING = 1.05 * 2.0**-24
 SMALLEST, LARGEST = 2.0**-40, 2.0**40
 # What float32 can lose of a radius at its lower end.
 TINY = 2.0**-90
+# Rows are begun eight at a time, levels have a multiple of four: so many rows after the last are written to as well.
+ROWS_BEYOND = 4
 # So many rows of a tile stay in the nearest cache.
 PANEL = 192
 
@@ -282,4 +284,4 @@ def track_output(F, X, J, M, out_weights, constants, levels, count, errors, own,
 @njit(cache=True, error_model="numpy")
 def tracking_floats(rows, cols):
     """Number of float64 that the table of errors of a system takes in scratch."""
-    return (rows + 4) * (symbol_stride(cols) + cols) // 2 + 24
+    return (rows + ROWS_BEYOND) * (symbol_stride(cols) + cols) // 2 + 24

@@ -214,16 +214,22 @@ def is_leaf(N, J, M, control, system):
     return count_choices(N, J, M, system, control[LEAF_CHOICES]) <= control[LEAF_CHOICES]
 
 
+@njit(cache=True, error_model="numpy")
+def load_states(N, J, M, cell, rows):
+    """Put the states of a cell's rows into J, where bounds narrow them."""
+    states = cell + CELL_HEADER
+    for r in range(rows):
+        J[STATE_LOW * M + r] = N[states + r]
+        J[STATE_HIGH * M + r] = N[states + rows + r]
+
+
 # Inlined before LLVM sees it: as a function of its own, all that it calls would be optimised once more.
 @njit(cache=True, error_model="numpy", inline="always")
 def visit(F, N, X, J, M, control, stack, output, tables, S, K, slot_of_tag, cell):
     """Process one cell that has been taken off the stack."""
     floats, system = N[cell + CELL_SYSTEM_F], N[cell + CELL_SYSTEM_I]
     rows = N[system + SYS_ROWS]
-    states = cell + CELL_HEADER
-    for r in range(rows):
-        J[STATE_LOW * M + r] = N[states + r]
-        J[STATE_HIGH * M + r] = N[states + rows + r]
+    load_states(N, J, M, cell, rows)
     large = N[system + SYS_UNITS] >= control[LARGE_UNITS]
     how = how_to_bound(N, cell, system, large)
     if how == FIRST_LEVEL:
