@@ -170,8 +170,10 @@ def _pack_system(network: Network, order: Integers) -> tuple[Floats, Integers]:
     out_affine[3] = network.output.bias
     out_weights[col_of_variable[network.output.columns[~inside]]] = network.output.weights[~inside]
 
-    begin = np.repeat(np.array(starts, np.int64)[1:], np.diff(starts))[col_row]
-    end = np.maximum(_last_rows(weights), begin)
+    level_starts = np.array(starts, np.int64)
+    level_of_column = np.searchsorted(level_starts, col_row, side="right") - 1
+    begin = level_starts[1:][level_of_column]
+    end = _extents(weights, level_starts, level_of_column)
     header = np.zeros(SYS_HEADER, np.int64)
     header[SYS_ROWS], header[SYS_COLS], header[SYS_LEVELS] = rows, cols, n_levels
     header[SYS_FLOATS], header[SYS_INTS] = system_floats(rows, cols), system_ints(rows, cols, n_levels)
@@ -183,14 +185,14 @@ def _pack_system(network: Network, order: Integers) -> tuple[Floats, Integers]:
     return floats, integers
 
 
-def _last_rows(weights: Floats) -> Integers:
-    """One past the last row that each column has weights on, rounded up to the lane width."""
-    cols, rows = weights.shape
-    if rows == 0:
-        return np.zeros(cols, np.int64)
+def _extents(weights: Floats, level_starts: Integers, level_of_column: Integers) -> Integers:
+    """Up to which row each column has weights: to the end of the last level that reads its level, or an earlier one."""
     used = weights != 0.0
-    last = np.where(used.any(axis=1), rows - used[:, ::-1].argmax(axis=1), 0)
-    return -(-last // WIDE) * WIDE
+    reads = np.logical_or.reduceat(used, level_starts[:-1], axis=1) if used.size else used
+    last_read = np.where(reads, np.arange(reads.shape[1]), 0).max(axis=1, initial=0)
+    last_read_of_level = np.zeros(level_starts.size, np.int64)
+    np.maximum.at(last_read_of_level, level_of_column, np.maximum(last_read, level_of_column))
+    return level_starts[1:][np.maximum.accumulate(last_read_of_level)[level_of_column]]
 
 
 def _pack_box(

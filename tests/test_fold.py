@@ -40,10 +40,32 @@ def _bound_and_fold(F, N, X, J, tables, cell, folded, folded_floats, least, larg
     return bounds[:3]
 
 
+@njit
+def _bound_and_fold_again(F, N, X, J, tables, cell, system, floats, folded, folded_floats):
+    """The same for the folded system, whose states are in J, on the half of the cell where all coordinates are low."""
+    M = X.size // X_REGIONS
+    f, n, x, j, knots = pointer(F), pointer(N), pointer(X), pointer(J), point_at_tables(tables)
+    place = N[cell + memory.CELL_FLOATS]
+    for _ in range(3):
+        low = F[place]
+        for v in range(N[cell + memory.CELL_VERTICES]):
+            F[place + v] = 0.5 * (F[place + v] + low)
+        place += N[cell + memory.CELL_CAPACITY]
+    linear, dead, _, _ = bound_units(f, n, x, j, M, knots, cell, system, floats, folded_floats, True, False)
+    fold(f, n, x, j, M, system, floats, folded, folded_floats, UNSTABLE)
+    return linear + dead
+
+
 def _fold(
     network: Network, least: int, large: bool, lower: Floats = LOWER, upper: Floats = UPPER
 ) -> tuple[Floats, Integers, tuple[int, int, bool]]:
     """The folded system's floats and integers; all memory it could have used was NaN, or nonsense."""
+    F, N, _, _, _, start_f, start_n, bounds = _fold_in_place(network, least, large, lower, upper)
+    return F[start_f:], N[start_n:], bounds
+
+
+def _fold_in_place(network: Network, least: int, large: bool, lower: Floats, upper: Floats) -> tuple[Any, ...]:
+    """The arrays of a worker after folding, the packed network, where the folded system is in F and N, and bounds."""
     packed = pack(network, lower, upper)
     room = -(-(max(packed.rows, memory.symbol_stride(packed.cols)) + 8) // 8) * 8
     X, J = np.full(X_REGIONS * room, np.nan), np.full(J_REGIONS * room, 1 << 40)
@@ -52,7 +74,7 @@ def _fold(
     F = np.concatenate([packed.F, np.full(start_f - packed.F.size + more + 64, np.nan)])
     N = np.concatenate([packed.N, np.full(packed.N.size + 64, 1 << 40)])
     bounds = _bound_and_fold(F, N, X, J, packed.tables, packed.root, start_n, start_f, least, large)
-    return F[start_f:], N[start_n:], bounds
+    return F, N, X, J, packed, start_f, start_n, bounds
 
 
 def _values(F: Floats, N: Integers, units: list[Unit], points: Floats) -> Floats:
@@ -141,6 +163,21 @@ def test_folded_systems_are_the_same_function(name: str, least: int, large: bool
     assert left_out > 0 or (name, least) == ("tables", LINEAR)
     assert N[memory.SYS_UNITS] == packed.N[memory.SYS_UNITS] - left_out
     _assert_same_function(network, F, N, LOWER, UPPER)
+
+
+@pytest.mark.parametrize("least", [UNSTABLE, LINEAR], ids=["all settled", "dead only"])
+@pytest.mark.parametrize("name", NETWORKS)
+def test_systems_are_folded_again(name: str, least: int) -> None:
+    network = canonicalize(NETWORKS[name](), lower=LOWER, upper=UPPER).network
+    F, N, X, J, packed, floats, system, _ = _fold_in_place(network, least, False, LOWER, UPPER)
+    again_f = -(-(floats + int(N[system + memory.SYS_FLOATS])) // 8) * 8
+    again_n = system + int(N[system + memory.SYS_INTS])
+    F[again_f:] = np.nan
+    F, N = np.concatenate([F, np.full(F.size, np.nan)]), np.concatenate([N, np.full(N.size, 1 << 40)])
+    left_out = _bound_and_fold_again(F, N, X, J, packed.tables, packed.root, system, floats, again_n, again_f)
+    assert left_out > 0
+    assert N[again_n + memory.SYS_UNITS] == N[system + memory.SYS_UNITS] - left_out
+    _assert_same_function(network, F[again_f:], N[again_n:], LOWER, 0.5 * (LOWER + UPPER))
 
 
 @pytest.mark.parametrize("seed", range(20))

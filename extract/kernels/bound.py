@@ -332,9 +332,7 @@ def bound_output_form(F, N, X, M, system, floats):
         while width < 4 and c > width and N[col_begin + c - 1 - width] == begin:
             width += 1
         c -= width
-        end = begin
-        for k in range(width):
-            end = max(end, N[col_end + c + k])
+        end = N[col_end + c]
         last = width - 1
         summed = multiply_columns(
             F, X, multiplier, weights + c * rows, min(1, last) * rows, min(2, last) * rows, last * rows, begin, end

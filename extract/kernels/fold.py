@@ -12,7 +12,7 @@ import numpy as np
 from numba import njit
 
 from mn_onnx.extract.kernels.lanes import fma, lanes_of, load_wide, splat, splat_wide, store
-from mn_onnx.extract.kernels.layout import lay_out_folded
+from mn_onnx.extract.kernels.layout import lay_out_folded, new_row
 from mn_onnx.extract.kernels.masks import (
     bits_of,
     both,
@@ -94,14 +94,20 @@ def read_settled_rows(F, N, X, J, M, system, floats, first, last, new_cols, work
     """
     rows, cols = N[system + SYS_ROWS], N[system + SYS_COLS]
     col_begin = system + SYS_HEADER + N[system + SYS_LEVELS] + 1 + 2 * rows + 1 + cols
+    col_end = col_begin + cols
     weights = weights_of(floats, rows)
     level_begin = J[SETTLED_ROW * M + first]
     zero = splat(0.0)
-    # Columns of this level and later ones are not read.
-    read = 0
+    # Columns of this level and later ones are not read, nor those that end before.
+    read = unread = 0
     while read < new_cols and N[col_begin + J[OLD_COL * M + read]] <= level_begin:
         read += 1
-    for k in range(0, read, 4):
+    while unread < read and N[col_end + J[OLD_COL * M + unread]] <= level_begin:
+        unread += 1
+    for p in range(first, last):
+        for k in range(0, unread, 4):
+            store(F, work + p * stride + 4 + k, zero)
+    for k in range(unread, read, 4):
         a, b = weights + J[OLD_COL * M + k] * rows, weights + J[OLD_COL * M + min(k + 1, read - 1)] * rows
         c, d = (
             weights + J[OLD_COL * M + min(k + 2, read - 1)] * rows,
@@ -156,12 +162,12 @@ def express_settled_rows(F, N, X, J, M, system, floats, settled, new_cols, work,
 
 
 @njit(cache=True, error_model="numpy")
-def gather_column(F, J, M, source, begin, rows, target):
-    """Copy a column of ``rows`` weights to the new rows, from old row ``begin`` on.
+def gather_column(F, J, M, source, begin, end, target):
+    """Copy what the old rows ``begin : end`` have of a column to their new rows.
 
-    What follows the column is overwritten, see OVERWRITTEN.
+    What follows it is overwritten, see OVERWRITTEN.
     """
-    for chunk in range(begin >> 3, (rows + 7) >> 3):
+    for chunk in range(begin >> 3, (end + 7) >> 3):
         weights = load_wide(F, source + 8 * chunk)
         pack_store(F, target + J[PLACE * M + chunk], weights, mask_of(J[KEPT * M + chunk]))
 
@@ -176,13 +182,13 @@ def gather_settled(F, N, J, M, system, floats, settled, new_rows, gathered):
     col_begin = system + SYS_HEADER + N[system + SYS_LEVELS] + 1 + 2 * rows + 1 + cols
     col_end = col_begin + cols
     weights = weights_of(floats, rows)
-    begin = end = old_end = np.int64(0)
+    begin = end = np.int64(0)
     for p in range(settled):
         c = J[STABLE_COLS * M + p]
+        old_end = N[col_end + c]
         # Later rows only: a settled column is read by no row of its own level or before.
         while begin < new_rows and J[KEPT_ROWS * M + begin] < N[col_begin + c]:
             begin += 1
-        old_end = max(old_end, N[col_end + c])
         while end < new_rows and J[KEPT_ROWS * M + end] < old_end:
             end += 1
         gather_column(F, J, M, weights + c * rows, N[col_begin + c], old_end, gathered + p * new_rows)
@@ -198,29 +204,33 @@ def gather_settled(F, N, J, M, system, floats, settled, new_rows, gathered):
 def write_columns(F, N, J, M, system, floats, folded, weights, gathered, settled, work, stride):
     """Write the folded system's columns: the kept ones, and what the rows read of them through the settled ones.
 
-    A block of columns at a time, which is still in the nearer caches when it is added to.
+    A block of columns at a time, which is still in the nearer caches when it is added to. All columns of a level have
+    the same extents.
     """
-    old_rows = N[system + SYS_ROWS]
-    old_begin = system + SYS_HEADER + N[system + SYS_LEVELS] + 1 + 2 * old_rows + 1 + N[system + SYS_COLS]
+    old_rows, old_cols = N[system + SYS_ROWS], N[system + SYS_COLS]
+    old_begin = system + SYS_HEADER + N[system + SYS_LEVELS] + 1 + 2 * old_rows + 1 + old_cols
+    old_end = old_begin + old_cols
     old_weights = weights_of(floats, old_rows)
     rows, cols = N[folded + SYS_ROWS], N[folded + SYS_COLS]
     col_begin = folded + SYS_HEADER + N[folded + SYS_LEVELS] + 1 + 2 * rows + 1 + cols
     col_end = col_begin + cols
+    zero = splat(0.0)
     first = k = np.int64(0)
     while k < cols:
         # Settled units of this column's level or before do not read it.
         level_end = N[old_begin + J[OLD_COL * M + k]]
         while first < settled and J[SETTLED_ROW * M + first] < level_end:
             first += 1
-        begin = end = N[col_begin + k]
+        begin, end = N[col_begin + k], N[col_end + k]
+        since, until = N[old_begin + J[OLD_COL * M + k]], N[old_end + J[OLD_COL * M + k]]
+        reached = new_row(J, M, until) if until < old_rows else rows
         last = k
         while last < cols and last < k + COLUMN_BLOCK and N[col_begin + last] == begin:
-            end = max(end, N[col_end + last])
+            source, target = old_weights + J[OLD_COL * M + last] * old_rows, weights + last * rows
+            gather_column(F, J, M, source, since, until, target)
+            for q in range(max(reached, begin), end, 4):
+                store(F, target + q, zero)
             last += 1
-        for column in range(k, last):
-            old = J[OLD_COL * M + column]
-            source, target = old_weights + old * old_rows, weights + column * rows
-            gather_column(F, J, M, source, N[old_begin + old], old_rows, target)
         accumulate(F, J, M, weights + k * rows, last - k, begin, end, rows, gathered, first, settled, work + k, stride)
         k = last
 

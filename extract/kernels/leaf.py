@@ -120,17 +120,12 @@ def choose_state(N, X, J, M, system, tables, r, state):
 
 
 @njit(cache=True, error_model="numpy")
-def substitute(F, N, X, M, system, row, form, weights, stride):
-    """The affine ``form`` plus what it reads of the outputs of rows before ``row``, as chosen.
+def substitute(F, X, M, form, first, count, weights, stride):
+    """The affine ``form`` plus what it reads of the outputs ``first : count``, as chosen.
 
     The weight on column ``c`` is ``F[weights + c * stride]``.
     """
-    rows = N[system + SYS_ROWS]
-    row_col = system + SYS_HEADER + N[system + SYS_LEVELS] + 1 + rows
-    col_begin = row_col + rows + 1 + N[system + SYS_COLS]
-    for c in range(N[row_col + row]):
-        if N[col_begin + c] > row:
-            break
+    for c in range(first, count):
         form = fma(splat(F[weights + c * stride]), load(X, CHOSEN * M + 4 * c), form)
     return form
 
@@ -138,9 +133,16 @@ def substitute(F, N, X, M, system, row, form, weights, stride):
 @njit(cache=True, error_model="numpy")
 def substitute_row(F, N, X, M, system, floats, r, target):
     """Affine form of row ``r`` at ``X[target : target + 4]`` under the states chosen for the rows before it."""
-    rows, at = N[system + SYS_ROWS], floats + r
+    rows, cols, at = N[system + SYS_ROWS], N[system + SYS_COLS], floats + r
+    row_col = system + SYS_HEADER + N[system + SYS_LEVELS] + 1 + rows
+    col_begin = row_col + rows + 1 + cols
+    first, count = np.int64(0), N[row_col + r]
+    while first < count and N[col_begin + cols + first] <= r:
+        first += 1
+    while count > first and N[col_begin + count - 1] > r:
+        count -= 1
     form = lanes_of(F[at], F[at + rows], F[at + 2 * rows], F[at + 3 * rows])
-    store(X, target, substitute(F, N, X, M, system, r, form, weights_of(floats, rows) + r, rows))
+    store(X, target, substitute(F, X, M, form, first, count, weights_of(floats, rows) + r, rows))
 
 
 @njit(cache=True, error_model="numpy")
@@ -149,7 +151,7 @@ def substitute_output(F, N, X, M, system, floats, target):
     rows, cols = N[system + SYS_ROWS], N[system + SYS_COLS]
     out_weights = weights_of(floats, rows) + cols * rows
     form = load(F, out_weights + padded(cols))
-    store(X, target, substitute(F, N, X, M, system, rows, form, out_weights, np.int64(1)))
+    store(X, target, substitute(F, X, M, form, np.int64(0), cols, out_weights, np.int64(1)))
 
 
 @njit(cache=True, error_model="numpy")

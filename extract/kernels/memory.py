@@ -8,10 +8,12 @@ of four, in large systems of eight, ``cols`` outputs of these units, and the has
 away.
 
     N: the SYS_* header, level_start[levels + 1], row_unit[rows] (-1 where padded),
-       row_col[rows + 1], col_row[cols], col_begin[cols], col_end[cols] (the rows a column has weights on)
+       row_col[rows + 1], col_row[cols], col_begin[cols], col_end[cols] (the rows a column has weights on: whole
+       levels, the same for all columns of a level, and never fewer than for those of a level before)
     F: affine parts a0[rows], a1[rows], a2[rows], a3[rows] (constant); of units with one knot and one output
        knot[rows], left slope[rows], left intercept[rows], right slope[rows], right intercept[rows] (the knot is NaN for
-       other units, infinite where padded); weights[cols][rows], output weights[cols], output affine part[4]
+       other units, infinite where padded); weights[cols][rows] (anything before
+       col_begin and from col_end on), output weights[cols], output affine part[4]
 
 *Cell*: a simple convex polytope and its state ranges for the rows of its system.
 

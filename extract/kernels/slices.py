@@ -264,9 +264,7 @@ def bound_output(F, N, S, K, M, extent, system, floats, count):
         while width < 4 and p > width and N[col_begin + K[COLS * M + p - 1 - width]] == begin:
             width += 1
         p -= width
-        end = begin
-        for k in range(width):
-            end = max(end, N[col_end + K[COLS * M + p + k]])
+        end = N[col_end + K[COLS * M + p]]
         last = width - 1
         columns = K[read + p], K[read + p + min(1, last)], K[read + p + min(2, last)], K[read + p + last]
         multiply_columns(F, S, M, weights, columns, begin, end)
