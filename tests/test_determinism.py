@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
+import mn_onnx
 from mn_onnx.extract import schedule
 from mn_onnx.extract.invariants import Invariants, check_invariants
 from mn_onnx.extract.kernels import control as entries
@@ -20,6 +22,7 @@ from mn_onnx.ir.network import AffineRow, KnotTable, Network, Unit
 from oracle.random_networks import RandomNetwork, random_tables
 from oracle.sketch import as_network, evaluate
 
+MODELS = Path(__file__).parents[1] / "models"
 LOWER, UPPER = np.full(3, -1.0), np.full(3, 1.0)
 BODY = RandomNetwork(3, (("relu", 20), ("leaky_relu", 16), ("relu", 12)), True, 4).centred()
 NETWORKS = {
@@ -41,6 +44,18 @@ def _invariants(soup: PolygonSoup) -> Invariants:
 
 def _centroids(soup: PolygonSoup) -> NDArray[np.float64]:
     return np.add.reduceat(soup.corner_positions, soup.offsets[:-1]) / np.diff(soup.offsets)[:, None]
+
+
+@pytest.mark.parametrize("name", ["am_chair", "niq_fox"])
+def test_what_memory_held_before_changes_nothing(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also not how many cells are visited: a bound that reads such numbers may still be right, but wider."""
+    model = mn_onnx.load(MODELS / f"{name}.onnx")
+    counts = []
+    for content in (0.0, np.nan):
+        monkeypatch.setattr(schedule, "_aligned_floats", lambda size, content=content: np.full(size, content))
+        soup, statistics = traverse(model.network, model.lower, model.upper, threads=1)
+        counts.append((len(soup.offsets), statistics.nodes, statistics.pruned, statistics.trimmed, statistics.folds))
+    assert counts[0] == counts[1]
 
 
 def _assert_same_polygons(first: PolygonSoup, second: PolygonSoup) -> None:

@@ -29,7 +29,7 @@ from mn_onnx.extract.kernels.memory import (
 )
 from mn_onnx.extract.pack import Packed, pack
 from mn_onnx.extract.schedule import traverse
-from mn_onnx.ir.network import AffineRow, Network
+from mn_onnx.ir.network import AffineRow, KnotTable, Network
 from mn_onnx.ir.passes import canonicalize
 from oracle.random_networks import random_tables
 
@@ -88,7 +88,7 @@ def test_tracked_errors_enclose_units_more_tightly(layers: list[int]) -> None:
     margin = 1e-12
     assert np.all(values >= (low - tracked - margin)[:, None])
     assert np.all(values <= (high + tracked + margin)[:, None])
-    assert np.all(tracked <= summed)
+    assert np.all(tracked <= summed * (1.0 + 1e-12))
     assert np.array_equal(tracked == 0.0, summed == 0.0)
     assert tracked[-3:].max() < 0.5 * summed[-3:].max()
 
@@ -118,10 +118,65 @@ def test_tracked_errors_are_those_of_zonotopes_but_for_rounding(layers: list[int
     network = dense(layers, seed=8)
     expected = _radii_by_zonotopes(network)
     packed = pack(canonicalize(network, lower=LOWER, upper=UPPER).network, LOWER, UPPER)
-    _, _, tracked = _radii(packed, True)
+    _, high, tracked = _radii(packed, True)
     _, _, summed = _radii(packed, False)
+    live = high + tracked > 0.0
     assert np.all(tracked >= expected * (1.0 - 1e-9))
-    assert np.all(tracked <= expected + 1e-3 * summed)
+    assert np.all(tracked[live] <= expected[live] + 1e-3 * summed[live])
+    assert np.all(tracked <= summed * (1.0 + 1e-12))
+
+
+def _with_units_below_their_knots(layers: list[int], seed: int) -> Network:
+    """Dense layers in which most units, in no regular order, are zero in all of the box."""
+    network = dense(layers, seed=seed)
+    below = np.random.default_rng(seed).random(len(network.units)) < 0.6
+    rows = [replace(unit.row, bias=unit.row.bias - 3.0 * low) for unit, low in zip(network.units, below, strict=True)]
+    units = tuple(replace(unit, row=row) for unit, row in zip(network.units, rows, strict=True))
+    return Network(3, units, network.output)
+
+
+@pytest.mark.parametrize("layers", [[48] * 6, [60, 52, 36, 64, 44, 57]], ids=str)
+def test_units_proved_zero_before_need_no_row_of_errors(layers: list[int]) -> None:
+    network = _with_units_below_their_knots(layers, seed=3)
+    expected = _radii_by_zonotopes(network)
+    packed = pack(canonicalize(network, lower=LOWER, upper=UPPER).network, LOWER, UPPER)
+    _, high, tracked = _radii(packed, True)
+    _, _, summed = _radii(packed, False)
+    without_row = tracked > expected + 1e-3 * summed
+    starts = np.cumsum([0, *layers])
+    assert np.add.reduceat(without_row, starts[2:-1], dtype=np.int64).min() > 8
+    assert np.all(high[without_row] + tracked[without_row] < 0.0)
+    assert np.all(tracked >= expected * (1.0 - 1e-9))
+    assert np.all(tracked <= summed * (1.0 + 1e-12))
+
+
+def _with_flat_units(layers: list[int], seed: int) -> Network:
+    """Dense layers of ReLU; every third unit's output is divided by 4,096, and the weights on it are multiplied."""
+    network = dense(layers, seed=seed)
+    flat = KnotTable.exact([0.0], [[0.0, 2.0**-12]], [[0.0, 0.0]])
+
+    def scaled(row: AffineRow) -> AffineRow:
+        is_flat = (row.columns >= 3) & (row.columns % 3 == 0)
+        return replace(row, weights=np.where(is_flat, 2.0**12, 1.0) * row.weights)
+
+    units = [
+        replace(unit, row=scaled(unit.row), functions=(flat,) if g % 3 == 0 else unit.functions)
+        for g, unit in enumerate(network.units)
+    ]
+    return Network(3, tuple(units), scaled(network.output))
+
+
+def test_errors_go_on_through_flat_outputs_as_their_own() -> None:
+    plain = canonicalize(dense([24] * 6, seed=2), lower=LOWER, upper=UPPER).network
+    network = canonicalize(_with_flat_units([24] * 6, seed=2), lower=LOWER, upper=UPPER).network
+    _, _, without_flat = _radii(pack(plain, LOWER, UPPER), True)
+    low, high, tracked = _radii(pack(network, LOWER, UPPER), True)
+    _, _, summed = _radii(pack(network, LOWER, UPPER), False)
+    values = _pre_activations(network, np.random.default_rng(0).uniform(LOWER, UPPER, (2000, 3)))
+    assert np.all(values >= (low - tracked - 1e-12)[:, None])
+    assert np.all(values <= (high + tracked + 1e-12)[:, None])
+    assert np.all(tracked <= summed * (1.0 + 1e-12))
+    assert without_flat[-24:].mean() < tracked[-24:].mean() < summed[-24:].mean()
 
 
 @pytest.mark.parametrize(

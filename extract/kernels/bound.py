@@ -10,20 +10,16 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from mn_onnx.extract.kernels.error_symbols import ROWS_BEYOND, number_errors, track_errors, track_output
+from mn_onnx.extract.kernels.centres import read_outputs, read_tracked_outputs, row_extremes
+from mn_onnx.extract.kernels.error_symbols import ROWS_BEYOND, clear_row, number_errors, track_errors, track_output
 from mn_onnx.extract.kernels.lanes import (
     fma,
     halves,
     lane,
-    larger,
     load,
-    load_like,
     load_wide,
     magnitude,
-    prefetch,
-    smaller,
     splat,
-    splat_like,
     splat_wide,
     store,
     total,
@@ -31,23 +27,18 @@ from mn_onnx.extract.kernels.lanes import (
 )
 from mn_onnx.extract.kernels.memory import (
     CELL_CAPACITY,
-    CELL_FLOATS,
-    CELL_VERTICES,
     CENTRE_AT,
     COL_KIND,
     ERROR,
     GROWTH,
-    HIGH,
     KIND,
     LEVEL_OUTPUT,
+    LEVEL_ROW,
     LEVEL_SYMBOL,
-    LOW,
     OFFSET,
     OUT_COEF,
     OUT_VALUES,
-    OUTPUTS,
     RADIUS,
-    READ_AT,
     READ_COLS,
     SLOPE,
     SYS_COLS,
@@ -63,117 +54,11 @@ from mn_onnx.extract.kernels.memory import (
 )
 from mn_onnx.extract.kernels.polytope import evaluate_affine, value_range
 from mn_onnx.extract.kernels.relax import MARGIN
-from mn_onnx.extract.kernels.settle import AGAIN, FIRST, settle_rows
+from mn_onnx.extract.kernels.settle import AGAIN, FIRST, list_live_rows, settle_rows
 
 # Large cells are bounded no further than a level of whose units less than one in so many settles: of later levels
 # still fewer do, and the output could be anything.
 LEAST_SETTLED = 4
-
-
-@njit(cache=True, error_model="numpy")
-def row_extremes(F, N, X, M, cell, begin, end):
-    """LOW and HIGH of rows ``begin:end`` (multiples of the lane width) over the cell's vertices."""
-    r = begin
-    while r + 8 <= end:
-        row_extremes_lanes(splat_wide(0.0), F, N, X, M, cell, r)
-        r += 8
-    if r < end:
-        row_extremes_lanes(splat(0.0), F, N, X, M, cell, r)
-
-
-@njit(cache=True, error_model="numpy", inline="always")
-def row_extremes_lanes(like, F, N, X, M, cell, r):
-    """`row_extremes` for as many rows from ``r`` on as ``like`` has lanes."""
-    n, x, capacity = N[cell + CELL_VERTICES], N[cell + CELL_FLOATS], N[cell + CELL_CAPACITY]
-    y, z = x + capacity, x + 2 * capacity
-    c0, c1 = load_like(like, X, r), load_like(like, X, M + r)
-    c2, c3 = load_like(like, X, 2 * M + r), load_like(like, X, 3 * M + r)
-    low = fma(c0, splat_like(like, F[x]), fma(c1, splat_like(like, F[y]), fma(c2, splat_like(like, F[z]), c3)))
-    high = low
-    for v in range(1, n):
-        value = fma(c2, splat_like(like, F[z + v]), c3)
-        value = fma(c0, splat_like(like, F[x + v]), fma(c1, splat_like(like, F[y + v]), value))
-        low = smaller(value, low)
-        high = larger(value, high)
-    store(X, LOW * M + r, low)
-    store(X, HIGH * M + r, high)
-
-
-@njit(cache=True, error_model="numpy")
-def read_outputs(F, X, J, M, floats, rows, begin, end, first, count):
-    """Centres of rows ``begin:end``: their affine parts plus what they read of outputs ``first:count``.
-
-    Also X[GROWTH], radii that add up whatever the rows read.
-    """
-    weights = weights_of(floats, rows)
-    outputs = OUTPUTS * M
-    places = READ_AT * M
-    r = begin
-    while r + 16 <= end:
-        s = r + 8
-        c0, c1 = load_wide(F, floats + r), load_wide(F, floats + rows + r)
-        c2, c3 = load_wide(F, floats + 2 * rows + r), load_wide(F, floats + 3 * rows + r)
-        d0, d1 = load_wide(F, floats + s), load_wide(F, floats + rows + s)
-        d2, d3 = load_wide(F, floats + 2 * rows + s), load_wide(F, floats + 3 * rows + s)
-        c4, d4 = splat_wide(0.0), splat_wide(0.0)
-        for p in range(first, count):
-            at = weights + J[places + p] + r
-            w, v = load_wide(F, at), load_wide(F, at + 8)
-            # The next rows' weights: a column is a page or more, so the machine would not foresee them.
-            prefetch(F, at + 16)
-            prefetch(F, at + 24)
-            y = outputs + p
-            y0, y1, y2, y3, y4 = (
-                splat_wide(X[y]),
-                splat_wide(X[y + M]),
-                splat_wide(X[y + 2 * M]),
-                splat_wide(X[y + 3 * M]),
-                splat_wide(X[y + 4 * M]),
-            )
-            c0, d0 = fma(w, y0, c0), fma(v, y0, d0)
-            c1, d1 = fma(w, y1, c1), fma(v, y1, d1)
-            c2, d2 = fma(w, y2, c2), fma(v, y2, d2)
-            c3, d3 = fma(w, y3, c3), fma(v, y3, d3)
-            c4, d4 = fma(magnitude(w), y4, c4), fma(magnitude(v), y4, d4)
-        store(X, r, c0)
-        store(X, M + r, c1)
-        store(X, 2 * M + r, c2)
-        store(X, 3 * M + r, c3)
-        store(X, GROWTH * M + r, c4)
-        store(X, s, d0)
-        store(X, M + s, d1)
-        store(X, 2 * M + s, d2)
-        store(X, 3 * M + s, d3)
-        store(X, GROWTH * M + s, d4)
-        r += 16
-    if r + 8 <= end:
-        read_outputs_lanes(splat_wide(0.0), F, X, J, M, floats, rows, r, first, count)
-        r += 8
-    if r < end:
-        read_outputs_lanes(splat(0.0), F, X, J, M, floats, rows, r, first, count)
-
-
-@njit(cache=True, error_model="numpy", inline="always")
-def read_outputs_lanes(like, F, X, J, M, floats, rows, r, first, count):
-    """`read_outputs` for as many rows from ``r`` on as ``like`` has lanes."""
-    outputs, places = OUTPUTS * M, READ_AT * M
-    weights = weights_of(floats, rows) + r
-    c0, c1 = load_like(like, F, floats + r), load_like(like, F, floats + rows + r)
-    c2, c3 = load_like(like, F, floats + 2 * rows + r), load_like(like, F, floats + 3 * rows + r)
-    growth = splat_like(like, 0.0)
-    for p in range(first, count):
-        w = load_like(like, F, weights + J[places + p])
-        y = outputs + p
-        c0 = fma(w, splat_like(like, X[y]), c0)
-        c1 = fma(w, splat_like(like, X[y + M]), c1)
-        c2 = fma(w, splat_like(like, X[y + 2 * M]), c2)
-        c3 = fma(w, splat_like(like, X[y + 3 * M]), c3)
-        growth = fma(magnitude(w), splat_like(like, X[y + 4 * M]), growth)
-    store(X, r, c0)
-    store(X, M + r, c1)
-    store(X, 2 * M + r, c2)
-    store(X, 3 * M + r, c3)
-    store(X, GROWTH * M + r, growth)
 
 
 @njit(cache=True, error_model="numpy")
@@ -213,9 +98,12 @@ def bound_units(F, N, X, J, M, tables, cell, system, floats, scratch, tracked, l
     weights = weights_of(floats, rows)
     stride = symbol_stride(cols)
     errors = 2 * aligned(scratch)  # in float32
-    own = errors + rows * stride
-    read = own + ROWS_BEYOND * stride
-    J[LEVEL_OUTPUT * M] = J[LEVEL_SYMBOL * M] = 0
+    own = errors + (rows + ROWS_BEYOND) * stride
+    nothing = rows + ROWS_BEYOND + 1
+    read = own + 2 * stride
+    if tracked:
+        clear_row(F, own + stride, stride)
+    J[LEVEL_OUTPUT * M] = J[LEVEL_SYMBOL * M] = J[LEVEL_ROW * M] = 0
     first, count, linear, dead = np.int64(0), np.int64(0), 0, 0
     rounding = 0.0
     for level in range(levels):
@@ -223,15 +111,19 @@ def bound_units(F, N, X, J, M, tables, cell, system, floats, scratch, tracked, l
         # The outputs that no later row reads are at the front: extents only grow with the level.
         while first < count and N[col_end + J[READ_COLS * M + first]] <= begin:
             first += 1
-        read_outputs(F, X, J, M, floats, rows, begin, end, first, count)
         if tracked:
+            read_tracked_outputs(F, X, J, M, floats, rows, begin, end, first, count)
+        else:
+            read_outputs(F, X, J, M, floats, rows, begin, end, first, count)
+        row_extremes(F, N, X, M, cell, begin, end)
+        if tracked:
+            live = list_live_rows(F, N, X, J, M, tables.extent, row_unit, floats, rows, begin, end)
             rounding = track_errors(
-                F, X, J, M, weights, begin, end, level, first, count, errors, stride, read, rounding
+                F, X, J, M, weights, begin, end, live, level, first, count, errors, stride, read, rounding
             )
         else:
             for r in range(begin, end, 4):
                 store(X, RADIUS * M + r, load(X, GROWTH * M + r))
-        row_extremes(F, N, X, M, cell, begin, end)
         before = count
         new_linear, new_dead, count = settle_rows(
             F, N, X, J, M, tables, row_unit, row_col, floats, rows, begin, end, FIRST, count
@@ -244,7 +136,7 @@ def bound_units(F, N, X, J, M, tables, cell, system, floats, scratch, tracked, l
                 leave_unbounded(N, X, J, M, row_col, rows, end)
                 return linear, dead, False, -1.0
         if tracked:
-            tracked = number_errors(X, J, M, level, before, count)
+            tracked = number_errors(X, J, M, level, begin, before, count, nothing)
     radius = -1.0
     if tracked:
         out_weights = weights + cols * rows

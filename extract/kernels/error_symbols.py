@@ -8,7 +8,8 @@ deep systems only, and not for every cell.
 
 A row's coefficients are, for the symbols of outputs that it reads, their errors times its weights, and what the rows of
 these outputs have for the symbols before them, times weights and slopes. So the table has rows of pre-activations only.
-The network's output is one more row: that is what a backward pass over the same chords gives.
+The network's output is one more row: that is what a backward pass over the same chords gives. Units whose output is
+proved to be zero before, from the radii of the outputs that they read, need no row: a third of all in wide layers.
 
 The table is float32, and the radius is enlarged by the most that its rounding can have taken away: the magnitudes
 of all that is summed add up to no more than X[GROWTH], so n roundings in a row take at most n halves of a unit in the
@@ -23,33 +24,43 @@ from numba import njit
 from mn_onnx.extract.kernels.lanes import (
     as_singles,
     fma,
+    load_eight,
     load_singles,
     load_wide,
     magnitude,
     round_to_singles,
+    splat_eight,
     splat_singles,
     splat_wide,
     store,
     store_transposed,
+    times,
     total,
 )
+from mn_onnx.extract.kernels.masks import count_bits, mask_of, pack
 from mn_onnx.extract.kernels.memory import (
     CENTRE_AT,
     ERROR,
     GROWTH,
     LEVEL_OUTPUT,
+    LEVEL_ROW,
     LEVEL_SYMBOL,
+    LIVE,
+    LIVE_AT,
+    LIVE_ROWS,
     OUT_COEF,
     OUTPUTS,
     RADIUS,
     READ_AT,
     READ_COLS,
+    READ_ERROR,
+    READ_RADIUS,
     READ_ROW,
     READ_SLOPE,
     READ_SYMBOL,
     SLOPE,
-    SYMBOL_AT,
     SYMBOL_ERROR,
+    SYMBOL_OUTPUT,
     symbol_stride,
 )
 from mn_onnx.extract.kernels.relax import MARGIN
@@ -58,19 +69,22 @@ from mn_onnx.extract.kernels.relax import MARGIN
 ROUNDING = 1.05 * 2.0**-24
 # Errors are tracked as long as all of them add up to numbers in this range: there float32 is far from both its ends.
 SMALLEST, LARGEST = 2.0**-40, 2.0**40
-# What float32 can lose of a radius at its lower end.
-TINY = 2.0**-90
-# Rows are begun eight at a time, levels have a multiple of four: so many rows after the last are written to as well.
-ROWS_BEYOND = 4
+# What float32 can lose of a radius at its lower end: 2^-149 times LARGEST / LEAST_SLOPE for a symbol.
+TINY = 2.0**-80
+# Errors of a row go on through its outputs by slopes of at least this size, else as one new error of the output.
+LEAST_SLOPE = 2.0**-10
+# Rows are begun eight at a time: so many after the last are written to as well.
+ROWS_BEYOND = 8
 # So many rows of a tile stay in the nearest cache.
 PANEL = 192
 
 
 @njit(cache=True, error_model="numpy")
-def add_tile(E, J, target, stride, table, read, count, weights):
+def add_tile(E, J, target, stride, table, read, count, weights, room):
     """Add 16 symbols of what eight rows read of ``count`` rows before them to E[target].
 
-    ``table``: the first symbol's entry of row 0; ``read``: J's index of the rows read; ``weights``: eight for each.
+    ``table``: the first symbol's entry of row 0; ``read``: J's index of the rows read; ``weights``: eight for each,
+    ``room`` apart.
     """
     t1, t2, t3 = target + stride, target + 2 * stride, target + 3 * stride
     t4, t5, t6, t7 = target + 4 * stride, t1 + 4 * stride, t2 + 4 * stride, t3 + 4 * stride
@@ -86,7 +100,7 @@ def add_tile(E, J, target, stride, table, read, count, weights):
         a5 = fma(splat_singles(E[weights + 5]), u, a5)
         a6 = fma(splat_singles(E[weights + 6]), u, a6)
         a7 = fma(splat_singles(E[weights + 7]), u, a7)
-        weights += 8
+        weights += room
     store(E, target, a0)
     store(E, t1, a1)
     store(E, t2, a2)
@@ -98,45 +112,63 @@ def add_tile(E, J, target, stride, table, read, count, weights):
 
 
 @njit(cache=True, error_model="numpy")
-def gather_weights(F, E, X, J, M, weights, begin, end, first, count, read):
-    """The weights that rows ``begin:end`` have for the rows of the outputs ``first:count``, at E[read].
-
-    Eight rows after eight, and in each eight for every output; weights and slopes are multiplied.
-    """
-    outputs, zero = count - first, splat_wide(0.0)
-    for p in range(first, count):
-        column, slope = weights + J[READ_AT * M + p], splat_wide(X[READ_SLOPE * M + p])
-        block = read + 8 * (p - first)
-        for r in range(begin, end, 8):
-            store(E, block, round_to_singles(fma(load_wide(F, column + r), slope, zero)))
-            block += 8 * outputs
+def clear_row(F, row, stride):
+    """Write zeros to a row of the table."""
+    E = as_singles(F)
+    for q in range(row, row + stride, 16):
+        store(E, q, splat_singles(np.float32(0.0)))
 
 
 @njit(cache=True, error_model="numpy")
-def begin_rows(F, E, X, J, M, weights, begin, end, known, symbols, errors, stride):
-    """Rows ``begin:end`` of the table: what they read of the own errors ``known:symbols`` of outputs, else zero."""
-    nothing, zero = splat_singles(np.float32(0.0)), splat_wide(0.0)
-    for row in range(errors + begin * stride, errors + end * stride, stride):
+def gather_weights(F, E, X, J, M, weights, begin, end, live, first, count, read, room):
+    """Weights times X[READ_SLOPE] of the ``live`` rows of ``begin:end`` on the outputs ``first:count``.
+
+    At E[read], ``room`` numbers for each output.
+    """
+    zero = splat_wide(0.0)
+    for p in range(first, count):
+        column, slope = weights + J[READ_AT * M + p] + begin, splat_wide(X[READ_SLOPE * M + p])
+        if live == end - begin:
+            for r in range(0, live, 8):
+                store(E, read + r, round_to_singles(fma(load_wide(F, column + r), slope, zero)))
+        else:
+            for chunk in range((end - begin + 7) >> 3):
+                weight = pack(load_wide(F, column + 8 * chunk), mask_of(J[LIVE * M + chunk]))
+                store(E, read + J[LIVE_AT * M + chunk], round_to_singles(fma(weight, slope, zero)))
+        read += room
+
+
+@njit(cache=True, error_model="numpy")
+def begin_rows(E, X, J, M, live, known, symbols, errors, stride, read, room):
+    """So many rows of the table from E[errors] on: what they read of the own errors ``known:symbols``, else zero.
+
+    ``read``: what `gather_weights` has written, from output 0 on.
+    """
+    nothing = splat_singles(np.float32(0.0))
+    for row in range(errors, errors + live * stride, stride):
         for q in range(0, known, 16):
             store(E, row + q, nothing)
-        for q in range(symbols, (symbols + 15) & ~15, 16):
-            store(E, row + q, nothing)
     for s in range(known, symbols, 4):
-        at, own = SYMBOL_AT * M + s, SYMBOL_ERROR * M + s
-        a, b, c, d = weights + J[at], weights + J[at + 1], weights + J[at + 2], weights + J[at + 3]
-        e, f, g, h = splat_wide(X[own]), splat_wide(X[own + 1]), splat_wide(X[own + 2]), splat_wide(X[own + 3])
-        target = errors + begin * stride + s
-        for r in range(begin, end, 8):
+        at, own = SYMBOL_OUTPUT * M + s, SYMBOL_ERROR * M + s
+        a, b = read + J[at] * room, read + J[at + 1] * room
+        c, d = read + J[at + 2] * room, read + J[at + 3] * room
+        e, f = splat_eight(np.float32(X[own])), splat_eight(np.float32(X[own + 1]))
+        g, h = splat_eight(np.float32(X[own + 2])), splat_eight(np.float32(X[own + 3]))
+        target = errors + s
+        for r in range(0, live, 8):
             store_transposed(
                 E,
                 target,
                 stride,
-                round_to_singles(fma(load_wide(F, a + r), e, zero)),
-                round_to_singles(fma(load_wide(F, b + r), f, zero)),
-                round_to_singles(fma(load_wide(F, c + r), g, zero)),
-                round_to_singles(fma(load_wide(F, d + r), h, zero)),
+                times(load_eight(E, a + r), e),
+                times(load_eight(E, b + r), f),
+                times(load_eight(E, c + r), g),
+                times(load_eight(E, d + r), h),
             )
             target += 8 * stride
+    for row in range(errors, errors + live * stride, stride):
+        for q in range(symbols, (symbols + 15) & ~15, 16):
+            store(E, row + q, nothing)
 
 
 @njit(cache=True, error_model="numpy")
@@ -150,19 +182,22 @@ def summed_errors(E, target, symbols, growth, rounding):
 
 
 @njit(cache=True, error_model="numpy")
-def track_errors(F, X, J, M, weights, begin, end, level, first, count, errors, stride, read, rounding):
-    """Radii of rows ``begin:end`` of a level from the error of every single unit before.
+def track_errors(F, X, J, M, weights, begin, end, live, level, first, count, errors, stride, read, rounding):
+    """Radii of the ``live`` rows of ``begin:end``, those of a level, from the error of every single unit before.
 
     ``weights``: F's index of the columns. ``first:count``: the outputs that the rows read. In F as float32, the table
-    of errors starts at ``errors``, ``stride`` numbers for each row; ``read`` is scratch of a number for each row and
-    output. ``rounding``: how many roundings a number of the table may have had, as a share of X[GROWTH]; returns the
-    same with these rows.
+    of errors starts at ``errors``, ``stride`` numbers for each live row; ``read`` is scratch of two numbers for each
+    row and output. ``rounding``: how many roundings a number of the table may have had, as a share of X[GROWTH];
+    returns the same with these rows.
     """
     E = as_singles(F)
     symbols, outputs = J[LEVEL_SYMBOL * M + level], count - first
     known = J[READ_SYMBOL * M + first] if first < count else symbols
-    gather_weights(F, E, X, J, M, weights, begin, end, first, count, read)
-    begin_rows(F, E, X, J, M, weights, begin, end, known, symbols, errors, stride)
+    own_rows = errors + J[LEVEL_ROW * M + level] * stride
+    J[LEVEL_ROW * M + level + 1] = J[LEVEL_ROW * M + level] + live
+    room = (live + 15) & ~7
+    gather_weights(F, E, X, J, M, weights, begin, end, live, first, count, read, room)
+    begin_rows(E, X, J, M, live, known, symbols, own_rows, stride, read - first * room, room)
     earlier = 0
     for q in range(0, symbols, 16):
         # Errors of the tile's first level reach rows of later levels only.
@@ -171,36 +206,48 @@ def track_errors(F, X, J, M, weights, begin, end, level, first, count, errors, s
         p = max(first, J[LEVEL_OUTPUT * M + earlier + 1])
         while p < count:
             n = min(PANEL, count - p)
-            for r in range(begin, end, 8):
-                at = read + (r - begin) * outputs + 8 * (p - first)
-                add_tile(E, J, errors + r * stride + q, stride, errors + q, READ_ROW * M + p, n, at)
+            for r in range(0, live, 8):
+                at = read + (p - first) * room + r
+                add_tile(E, J, own_rows + r * stride + q, stride, errors + q, READ_ROW * M + p, n, at, room)
             p += PANEL
     rounding += ROUNDING * (outputs + (symbols >> 4) + 16)
-    for r in range(begin, end):
-        X[RADIUS * M + r] = summed_errors(E, errors + r * stride, symbols, X[GROWTH * M + r], rounding)
+    for r in range(live):
+        row = J[LIVE_ROWS * M + r]
+        X[RADIUS * M + row] = summed_errors(E, own_rows + r * stride, symbols, X[GROWTH * M + row], rounding)
     return rounding
 
 
 @njit(cache=True, error_model="numpy")
-def number_errors(X, J, M, level, begin, end):
+def number_errors(X, J, M, level, level_begin, begin, end, nothing):
     """A symbol for each of the outputs ``begin:end`` of a level that has an error of its own.
 
-    Returns whether all errors are of a size for float32.
+    J[READ_ROW] of the outputs becomes their row of the table; ``nothing``: one of zeros;
+    ``level_begin``: the level's first row. Returns whether all errors are of a size for float32.
     """
     symbols, fit = J[LEVEL_SYMBOL * M + level], True
     for p in range(begin, end):
-        c = J[READ_COLS * M + p]
-        X[READ_SLOPE * M + p] = X[SLOPE * M + c]
+        c, row = J[READ_COLS * M + p], J[READ_ROW * M + p]
+        chunk, before = (row - level_begin) >> 3, (1 << ((row - level_begin) & 7)) - 1
+        place = J[LIVE_AT * M + chunk] + count_bits(J[LIVE * M + chunk] & before)
+        J[READ_ROW * M + p] = J[LEVEL_ROW * M + level] + place
+        slope, error = X[SLOPE * M + c], X[ERROR * M + c]
+        X[READ_RADIUS * M + p] = abs(slope) * X[RADIUS * M + row] + error
+        if abs(slope) < LEAST_SLOPE:
+            # All errors of so flat an output are its own.
+            slope, error = 1.0, X[READ_RADIUS * M + p]
+            J[READ_ROW * M + p] = nothing
+        X[READ_SLOPE * M + p] = slope
+        X[READ_ERROR * M + p] = error
         J[READ_SYMBOL * M + p] = symbols
-        X[SYMBOL_ERROR * M + symbols] = X[ERROR * M + c]
-        J[SYMBOL_AT * M + symbols] = J[READ_AT * M + p]
-        symbols += X[ERROR * M + c] > 0.0
+        J[SYMBOL_OUTPUT * M + symbols] = p
+        X[SYMBOL_ERROR * M + symbols] = error / slope
+        symbols += error > 0.0
         growth = X[(OUTPUTS + 4) * M + p]
         fit &= (growth == 0.0) | ((growth > SMALLEST) & (growth < LARGEST))
-        fit &= X[GROWTH * M + J[READ_ROW * M + p]] < LARGEST
+        fit &= X[GROWTH * M + row] < LARGEST
     for s in range(symbols, symbols + 4):  # read, but of no output
         X[SYMBOL_ERROR * M + s] = 0.0
-        J[SYMBOL_AT * M + s] = 0
+        J[SYMBOL_OUTPUT * M + s] = end - 1
     J[LEVEL_OUTPUT * M + level + 1] = end
     J[LEVEL_SYMBOL * M + level + 1] = symbols
     return fit
@@ -271,7 +318,7 @@ def track_output(F, X, J, M, out_weights, constants, levels, count, errors, own,
         # What an output without an error of its own writes, the next one that has one writes over.
         weight, symbol = X[OUT_COEF * M + p], J[READ_SYMBOL * M + p]
         E[read + p] = np.float32(weight * X[READ_SLOPE * M + p])
-        E[own + symbol] = np.float32(weight * X[SYMBOL_ERROR * M + symbol])
+        E[own + symbol] = np.float32(weight * X[READ_ERROR * M + p])
     for level in range(1, levels):
         known = J[LEVEL_SYMBOL * M + level]
         end = J[LEVEL_OUTPUT * M + level + 1]
@@ -284,4 +331,4 @@ def track_output(F, X, J, M, out_weights, constants, levels, count, errors, own,
 @njit(cache=True, error_model="numpy")
 def tracking_floats(rows, cols):
     """Number of float64 that the table of errors of a system takes in scratch."""
-    return (rows + ROWS_BEYOND) * (symbol_stride(cols) + cols) // 2 + 24
+    return (rows + ROWS_BEYOND + 2) * symbol_stride(cols) // 2 + (rows + 24) * cols // 2 + 24

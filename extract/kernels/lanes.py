@@ -94,9 +94,35 @@ def load_singles(typing_context: Any, source: Any, index: Any) -> Any:
 
 
 @intrinsic
+def load_eight(typing_context: Any, source: Any, index: Any) -> Any:
+    """``source[index : index + WIDE]`` through a pointer to float32."""
+
+    def code(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        return builder.load(_vector_pointer(builder, wide_singles.vector, *arguments), align=4)
+
+    return wide_singles(source, types.int64), code
+
+
+@intrinsic
 def splat_singles(typing_context: Any, value: Any) -> Any:
     """The same number, rounded to float32, in `SINGLES` lanes."""
     return singles(types.float32), _splat
+
+
+@intrinsic
+def splat_eight(typing_context: Any, value: Any) -> Any:
+    """The same float32 in `WIDE` lanes."""
+    return wide_singles(types.float32), _splat
+
+
+@intrinsic
+def times(typing_context: Any, a: Any, b: Any) -> Any:
+    """Products."""
+
+    def code(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        return builder.fmul(*arguments)
+
+    return a(a, a), code
 
 
 @intrinsic

@@ -207,6 +207,22 @@ def lowest_bit(typing_context: Any, bits: Any) -> Any:
 
 
 @intrinsic
+def pack(typing_context: Any, value: Any, mask: Any) -> Any:
+    """The lanes of eight float64 where the mask holds, moved to the front; what follows is anything."""
+
+    def code(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        vector, mask = arguments
+        if _packs(context):
+            return _compress(builder, vector, mask, "f64")
+        space = cgutils.alloca_once(builder, ir.ArrayType(vector.type.element, 2 * WIDE))
+        place = builder.bitcast(space, vector.type.element.as_pointer())
+        _store_lanes(builder, place, vector, mask)
+        return builder.load(builder.bitcast(place, vector.type.as_pointer()), align=8)
+
+    return wide_lanes(wide_lanes, mask_lanes), code
+
+
+@intrinsic
 def pack_store(typing_context: Any, target: Any, index: Any, value: Any, mask: Any) -> Any:
     """Write the lanes where the mask holds to ``target`` from ``index`` on, without gaps.
 
@@ -215,18 +231,30 @@ def pack_store(typing_context: Any, target: Any, index: Any, value: Any, mask: A
 
     def code(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         target, index, vector, mask = arguments
-        if "+avx512f" in context.codegen().magic_tuple()[2]:
-            suffix = "f64" if value == wide_lanes else "i64"
-            kind = ir.FunctionType(vector.type, [vector.type, vector.type, mask.type])
-            name = f"llvm.x86.avx512.mask.compress.v{WIDE}{suffix}"
-            packed = builder.call(cgutils.get_or_insert_function(builder.module, kind, name), [vector, vector, mask])
+        if _packs(context):
+            packed = _compress(builder, vector, mask, "f64" if value == wide_lanes else "i64")
             place = builder.bitcast(builder.gep(target, [index]), vector.type.as_pointer())
             builder.store(packed, place, align=8)
             return context.get_dummy_value()
-        for k in range(WIDE):
-            at = ir.Constant(_INT32, k)
-            builder.store(builder.extract_element(vector, at), builder.gep(target, [index]))
-            index = builder.add(index, builder.zext(builder.extract_element(mask, at), _INT64))
+        _store_lanes(builder, builder.gep(target, [index]), vector, mask)
         return context.get_dummy_value()
 
     return types.none(target, types.int64, value, mask_lanes), code
+
+
+def _packs(context: Any) -> bool:
+    return "+avx512f" in context.codegen().magic_tuple()[2]
+
+
+def _compress(builder: Any, vector: Any, mask: Any, suffix: str) -> Any:
+    kind = ir.FunctionType(vector.type, [vector.type, vector.type, mask.type])
+    name = f"llvm.x86.avx512.mask.compress.v{WIDE}{suffix}"
+    return builder.call(cgutils.get_or_insert_function(builder.module, kind, name), [vector, vector, mask])
+
+
+def _store_lanes(builder: Any, place: Any, vector: Any, mask: Any) -> None:
+    """What `pack` does, by single stores: every lane over the last one that is not in the mask."""
+    for k in range(WIDE):
+        at = ir.Constant(_INT32, k)
+        builder.store(builder.extract_element(vector, at), place)
+        place = builder.gep(place, [builder.zext(builder.extract_element(mask, at), _INT64)])

@@ -43,8 +43,8 @@ CELL_END_F, CELL_END_I, CELL_DEPTH, CELL_HEADER = 5, 6, 7, 8
 OUTPUTS = 28  # five
 CUT_SHARE, GROWTH, SETTLED_SLOPE = 33, 34, 35
 CHOSEN = 36  # four
-READ_SLOPE, SYMBOL_ERROR = 40, 41
-X_REGIONS = 42
+READ_SLOPE, READ_ERROR, READ_RADIUS, SYMBOL_ERROR, REACH = 40, 41, 42, 43, 44
+X_REGIONS = 45
 # Kernels are called with these. numba compiles a kernel once more for every constant among its arguments, except for
 # numpy's: so their numbers are numpy's, as are the constants in the kernels' calls of each other.
 VALUES, OUT_VALUES, POLY_A, POLY_B = np.int64(11), np.int64(12), np.int64(13), np.int64(16)
@@ -57,8 +57,8 @@ TAGS_A, TAGS_B = np.int64(8), np.int64(9)  # kernels are called with them
 (LEVEL_OUTPUT, LEVEL_SYMBOL, READ_ROW) = (22, 23, 24)
 (KEPT, PLACE, OLD_COL, SETTLED_ROW, COL_KIND) = (25, 26, 27, 28, 29)
 SINCE, UNTIL = np.int64(30), np.int64(31)
-READ_SYMBOL, SYMBOL_AT = 32, 33
-J_REGIONS = 34
+READ_SYMBOL, SYMBOL_OUTPUT, LIVE, LIVE_AT, LIVE_ROWS, LEVEL_ROW = 32, 33, 34, 35, 36, 37
+J_REGIONS = 38
 
 # What F has for every row of a system, apart from the weights: the affine part, and the two pieces around its knot.
 PIECE_FLOATS = 5

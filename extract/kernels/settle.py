@@ -34,10 +34,14 @@ from mn_onnx.extract.kernels.memory import (
     HIGH,
     KIND,
     LINEAR,
+    LIVE,
+    LIVE_AT,
+    LIVE_ROWS,
     LOW,
     OFFSET,
     OUTPUTS,
     RADIUS,
+    REACH,
     READ_AT,
     READ_COLS,
     READ_ROW,
@@ -54,28 +58,85 @@ FIRST, AGAIN = np.bool_(False), np.bool_(True)
 
 
 @njit(cache=True, error_model="numpy")
+def enclose_eight(X, M, extent, r, radius):
+    """Ranges of rows ``r : r + 8``: X[LOW] and X[HIGH] of their centres, and ``radius`` with what rounding may add.
+
+    A row whose radius is 0 is affine on the cell, and its range is exact.
+    """
+    zero = splat_wide(0.0)
+    c0, c1, c2, c3 = load_wide(X, r), load_wide(X, M + r), load_wide(X, 2 * M + r), load_wide(X, 3 * M + r)
+    reach = choose(is_below(zero, radius), with_rounding(c0, c1, c2, c3, radius, extent), zero)
+    low = fma(splat_wide(-1.0), reach, load_wide(X, LOW * M + r))
+    return low, fma(splat_wide(1.0), reach, load_wide(X, HIGH * M + r))
+
+
+@njit(cache=True, error_model="numpy")
+def sides_of_knots(J, M, r, knot, low, high):
+    """Where rows ``r : r + 8`` of one knot are above it, or else under it, all over the cell: by state or by range."""
+    no, yes = splat_integer(0), splat_integer(1)
+    first, last = load_integers(J, STATE_LOW * M + r), load_integers(J, STATE_HIGH * M + r)
+    above = either(same(first, yes), both(same(last, yes), at_least(low, knot)))
+    return above, without(either(same(last, no), is_below(high, knot)), above)
+
+
+@njit(cache=True, error_model="numpy")
+def list_live_rows(F, N, X, J, M, extent, row_unit, floats, rows, begin, end):
+    """List the units of ``begin : end`` whose output may be other than zero, with X[REACH] as radii; returns how many.
+
+    J[LIVE_ROWS] are their rows; for every eight rows from ``begin`` on, J[LIVE] has the same as bits, and J[LIVE_AT]
+    the place of the first in the list. The radii of all rows become X[REACH]: with these, those not listed settle.
+    If the list takes as many eights as the rows do, it is all of them.
+    """
+    table = knots_of(floats, rows)
+    zero, no = splat_wide(0.0), splat_integer(0)
+    live = np.int64(0)
+    for r in range(begin, end, 8):
+        inside = is_below(count_up(r), splat_integer(end))
+        knot, left, left_at = (
+            load_wide(F, table + r),
+            load_wide(F, table + rows + r),
+            load_wide(F, table + 2 * rows + r),
+        )
+        right, right_at = load_wide(F, table + 3 * rows + r), load_wide(F, table + 4 * rows + r)
+        reach = load_wide(X, REACH * M + r)
+        store(X, RADIUS * M + r, reach)
+        low, high = enclose_eight(X, M, extent, r, reach)
+        above, under = sides_of_knots(J, M, r, knot, low, high)
+        dead_above = both(above, both(same(right, zero), same(right_at, zero)))
+        dead_under = both(under, both(same(left, zero), same(left_at, zero)))
+        listed = both(inside, at_least(load_integers(N, row_unit + r), no))
+        if bits_of(without(inside, same(knot, knot))) == 0:
+            listed = without(listed, either(dead_above, dead_under))
+        chunk = (r - begin) >> 3
+        J[LIVE * M + chunk], J[LIVE_AT * M + chunk] = bits_of(listed), live
+        pack_store(J, LIVE_ROWS * M + live, count_up(r), listed)
+        live += count_bits(bits_of(listed))
+    if (live + 7) >> 3 < (end - begin + 7) >> 3:
+        return live
+    for r in range(begin, end, 8):
+        chunk = (r - begin) >> 3
+        J[LIVE * M + chunk], J[LIVE_AT * M + chunk] = 0xFF, r - begin
+        store(J, LIVE_ROWS * M + r - begin, count_up(r))
+    return end - begin
+
+
+@njit(cache=True, error_model="numpy")
 def settle_eight(F, X, J, M, extent, table, rows, r, inside):
     """Settle and relax rows ``r : r + 8`` where ``inside`` holds, all of them of one knot and one output, or padding.
 
     ``table``: where the system's knots begin in F. Tightens STATE_LOW and STATE_HIGH and sets KIND. Returns slopes,
     offsets and errors, the masks of settled rows and of those whose output is zero, and the kinds.
     """
-    zero, one = splat_wide(0.0), splat_wide(1.0)
+    zero = splat_wide(0.0)
     no, yes = splat_integer(0), splat_integer(1)
     knot, left, left_at = load_wide(F, table + r), load_wide(F, table + rows + r), load_wide(F, table + 2 * rows + r)
     right, right_at = load_wide(F, table + 3 * rows + r), load_wide(F, table + 4 * rows + r)
-    radius = load_wide(X, RADIUS * M + r)
-    c0, c1, c2, c3 = load_wide(X, r), load_wide(X, M + r), load_wide(X, 2 * M + r), load_wide(X, 3 * M + r)
-    # Exactly 0 for a row that is affine on the cell.
-    reach = choose(is_below(zero, radius), with_rounding(c0, c1, c2, c3, radius, extent), zero)
-    low = fma(splat_wide(-1.0), reach, load_wide(X, LOW * M + r))
-    high = fma(one, reach, load_wide(X, HIGH * M + r))
-    first, last = load_integers(J, STATE_LOW * M + r), load_integers(J, STATE_HIGH * M + r)
-    above = either(same(first, yes), both(same(last, yes), at_least(low, knot)))
-    under = without(either(same(last, no), is_below(high, knot)), above)
+    low, high = enclose_eight(X, M, extent, r, load_wide(X, RADIUS * M + r))
+    above, under = sides_of_knots(J, M, r, knot, low, high)
     settled = either(above, under)
     slope, offset, error = relax_one_knot(knot, left, left_at, right, right_at, low, high, above, under)
     dead = both(settled, both(same(slope, zero), same(offset, zero)))
+    first, last = load_integers(J, STATE_LOW * M + r), load_integers(J, STATE_HIGH * M + r)
     kind = choose(dead, splat_integer(DEAD), choose(settled, splat_integer(LINEAR), splat_integer(UNSTABLE)))
     store(J, STATE_LOW * M + r, choose(inside, choose(above, yes, no), first))
     store(J, STATE_HIGH * M + r, choose(inside, choose(under, no, yes), last))
