@@ -30,30 +30,16 @@ LOWER, UPPER = np.array([0.1, -0.3, 0.2]), np.array([0.4, 0.0, 0.5])
 
 
 @njit
-def _bound_and_fold(F, N, X, J, tables, cell, folded, folded_floats, least, large):
+def _bound_and_fold(F, N, X, J, tables, cell, system, floats, folded, folded_floats, least, large):
+    """Fold a system by bounds on the cell, whose states are in N if it is the first, else in J."""
     M = X.size // X_REGIONS
     f, n, x, j, knots = pointer(F), pointer(N), pointer(X), pointer(J), point_at_tables(tables)
-    load_states(n, j, M, cell, N[memory.SYS_ROWS])
-    bounds = bound_units(f, n, x, j, M, knots, cell, 0, 0, folded_floats, True, large)
-    fold(f, n, x, j, M, 0, 0, folded, folded_floats, least)
-    carry_states(n, j, M, knots, 0, folded, least)
+    if system == 0:
+        load_states(n, j, M, cell, N[memory.SYS_ROWS])
+    bounds = bound_units(f, n, x, j, M, knots, cell, system, floats, folded_floats, True, large)
+    fold(f, n, x, j, M, system, floats, folded, folded_floats, least)
+    carry_states(n, j, M, knots, system, folded, least)
     return bounds[:3]
-
-
-@njit
-def _bound_and_fold_again(F, N, X, J, tables, cell, system, floats, folded, folded_floats):
-    """The same for the folded system, whose states are in J, on the half of the cell where all coordinates are low."""
-    M = X.size // X_REGIONS
-    f, n, x, j, knots = pointer(F), pointer(N), pointer(X), pointer(J), point_at_tables(tables)
-    place = N[cell + memory.CELL_FLOATS]
-    for _ in range(3):
-        low = F[place]
-        for v in range(N[cell + memory.CELL_VERTICES]):
-            F[place + v] = 0.5 * (F[place + v] + low)
-        place += N[cell + memory.CELL_CAPACITY]
-    linear, dead, _, _ = bound_units(f, n, x, j, M, knots, cell, system, floats, folded_floats, True, False)
-    fold(f, n, x, j, M, system, floats, folded, folded_floats, UNSTABLE)
-    return linear + dead
 
 
 def _fold(
@@ -73,7 +59,7 @@ def _fold_in_place(network: Network, least: int, large: bool, lower: Floats, upp
     more = max(tracking_floats(packed.rows, packed.cols), folding_floats(packed.rows, packed.cols))
     F = np.concatenate([packed.F, np.full(start_f - packed.F.size + more + 64, np.nan)])
     N = np.concatenate([packed.N, np.full(packed.N.size + 64, 1 << 40)])
-    bounds = _bound_and_fold(F, N, X, J, packed.tables, packed.root, start_n, start_f, least, large)
+    bounds = _bound_and_fold(F, N, X, J, packed.tables, packed.root, 0, 0, start_n, start_f, least, large)
     return F, N, X, J, packed, start_f, start_n, bounds
 
 
@@ -174,9 +160,15 @@ def test_systems_are_folded_again(name: str, least: int) -> None:
     again_n = system + int(N[system + memory.SYS_INTS])
     F[again_f:] = np.nan
     F, N = np.concatenate([F, np.full(F.size, np.nan)]), np.concatenate([N, np.full(N.size, 1 << 40)])
-    left_out = _bound_and_fold_again(F, N, X, J, packed.tables, packed.root, system, floats, again_n, again_f)
-    assert left_out > 0
-    assert N[again_n + memory.SYS_UNITS] == N[system + memory.SYS_UNITS] - left_out
+    # The half of the cell where all coordinates are low.
+    at, vertices = (int(N[packed.root + entry]) for entry in (memory.CELL_FLOATS, memory.CELL_VERTICES))
+    corners = F[at : at + 3 * vertices].reshape(3, vertices)
+    corners[:] = 0.5 * (corners + LOWER[:, None])
+    linear, dead, _ = _bound_and_fold(
+        F, N, X, J, packed.tables, packed.root, system, floats, again_n, again_f, UNSTABLE, False
+    )
+    assert linear + dead > 0
+    assert N[again_n + memory.SYS_UNITS] == N[system + memory.SYS_UNITS] - linear - dead
     _assert_same_function(network, F[again_f:], N[again_n:], LOWER, 0.5 * (LOWER + UPPER))
 
 
