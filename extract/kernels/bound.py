@@ -98,6 +98,7 @@ def bound_units(F, N, X, J, M, tables, cell, system, floats, scratch, tracked, l
     weights = weights_of(floats, rows)
     stride = symbol_stride(cols)
     errors = 2 * aligned(scratch)  # in float32
+    # After the rows of units, the output's and one of zeros.
     own = errors + (rows + ROWS_BEYOND) * stride
     nothing = rows + ROWS_BEYOND + 1
     read = own + 2 * stride

@@ -53,7 +53,6 @@ from mn_onnx.extract.kernels.memory import (
     RADIUS,
     READ_AT,
     READ_COLS,
-    READ_ERROR,
     READ_RADIUS,
     READ_ROW,
     READ_SLOPE,
@@ -186,9 +185,9 @@ def track_errors(F, X, J, M, weights, begin, end, live, level, first, count, err
     """Radii of the ``live`` rows of ``begin:end``, those of a level, from the error of every single unit before.
 
     ``weights``: F's index of the columns. ``first:count``: the outputs that the rows read. In F as float32, the table
-    of errors starts at ``errors``, ``stride`` numbers for each live row; ``read`` is scratch of two numbers for each
-    row and output. ``rounding``: how many roundings a number of the table may have had, as a share of X[GROWTH];
-    returns the same with these rows.
+    of errors starts at ``errors``, ``stride`` numbers for each live row; ``read`` is scratch of a number for each row
+    and output. ``rounding``: how many roundings a number of the table may have had, as a share of X[GROWTH]; returns
+    the same with these rows.
     """
     E = as_singles(F)
     symbols, outputs = J[LEVEL_SYMBOL * M + level], count - first
@@ -237,7 +236,6 @@ def number_errors(X, J, M, level, level_begin, begin, end, nothing):
             slope, error = 1.0, X[READ_RADIUS * M + p]
             J[READ_ROW * M + p] = nothing
         X[READ_SLOPE * M + p] = slope
-        X[READ_ERROR * M + p] = error
         J[READ_SYMBOL * M + p] = symbols
         J[SYMBOL_OUTPUT * M + symbols] = p
         X[SYMBOL_ERROR * M + symbols] = error / slope
@@ -317,8 +315,9 @@ def track_output(F, X, J, M, out_weights, constants, levels, count, errors, own,
     for p in range(count):
         # What an output without an error of its own writes, the next one that has one writes over.
         weight, symbol = X[OUT_COEF * M + p], J[READ_SYMBOL * M + p]
-        E[read + p] = np.float32(weight * X[READ_SLOPE * M + p])
-        E[own + symbol] = np.float32(weight * X[READ_ERROR * M + p])
+        weight *= X[READ_SLOPE * M + p]
+        E[read + p] = np.float32(weight)
+        E[own + symbol] = np.float32(weight * X[SYMBOL_ERROR * M + symbol])
     for level in range(1, levels):
         known = J[LEVEL_SYMBOL * M + level]
         end = J[LEVEL_OUTPUT * M + level + 1]

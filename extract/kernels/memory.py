@@ -12,8 +12,8 @@ away.
        levels, the same for all columns of a level, and never fewer than for those of a level before)
     F: affine parts a0[rows], a1[rows], a2[rows], a3[rows] (constant); of units with one knot and one output
        knot[rows], left slope[rows], left intercept[rows], right slope[rows], right intercept[rows] (the knot is NaN for
-       other units, infinite where padded); weights[cols][rows] (anything before
-       col_begin and from col_end on), output weights[cols], output affine part[4]
+       other units, infinite where padded); weights[cols][rows] (anything before col_begin and
+       from col_end on), output weights[cols], output affine part[4]
 
 *Cell*: a simple convex polytope and its state ranges for the rows of its system.
 
@@ -43,8 +43,8 @@ CELL_END_F, CELL_END_I, CELL_DEPTH, CELL_HEADER = 5, 6, 7, 8
 OUTPUTS = 28  # five
 CUT_SHARE, GROWTH, SETTLED_SLOPE = 33, 34, 35
 CHOSEN = 36  # four
-READ_SLOPE, READ_ERROR, READ_RADIUS, SYMBOL_ERROR, REACH = 40, 41, 42, 43, 44
-X_REGIONS = 45
+READ_SLOPE, READ_RADIUS, SYMBOL_ERROR, REACH = 40, 41, 42, 43
+X_REGIONS = 44
 # Kernels are called with these. numba compiles a kernel once more for every constant among its arguments, except for
 # numpy's: so their numbers are numpy's, as are the constants in the kernels' calls of each other.
 VALUES, OUT_VALUES, POLY_A, POLY_B = np.int64(11), np.int64(12), np.int64(13), np.int64(16)
