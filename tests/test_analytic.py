@@ -9,11 +9,18 @@ from mn_onnx.extract.invariants import check_invariants
 from mn_onnx.extract.pipeline import extract_surface
 from mn_onnx.extract.weld import weld
 from mn_onnx.ir.evaluate import evaluate
+from mn_onnx.warmup import warm_up
 from oracle.corpus import CORPUS, Case
 from oracle.level_set import exact_level_set
 from oracle.point_sets import exact_counts, point_set_counts
 from oracle.sketch import as_network
 from oracle.soups import as_soup
+
+
+@pytest.fixture(scope="module", autouse=True)
+def compiled_kernels() -> None:
+    """Kernels compiled by two processes: in a new checkout these tests are the first, and would do it in one."""
+    warm_up()
 
 
 @pytest.mark.parametrize("case", CORPUS, ids=str)

@@ -27,6 +27,7 @@ from oracle.random_networks import random_tables
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 LOWER, UPPER = np.array([0.1, -0.3, 0.2]), np.array([0.4, 0.0, 0.5])
+TRACKED = np.bool_(True)  # numpy's: for a constant of Python's, numba would compile the kernels once more
 
 
 @njit
@@ -36,7 +37,7 @@ def _bound_and_fold(F, N, X, J, tables, cell, system, floats, folded, folded_flo
     f, n, x, j, knots = pointer(F), pointer(N), pointer(X), pointer(J), point_at_tables(tables)
     if system == 0:
         load_states(n, j, M, cell, N[memory.SYS_ROWS])
-    bounds = bound_units(f, n, x, j, M, knots, cell, system, floats, folded_floats, True, large)
+    bounds = bound_units(f, n, x, j, M, knots, cell, system, floats, folded_floats, TRACKED, large)
     fold(f, n, x, j, M, system, floats, folded, folded_floats, least)
     carry_states(n, j, M, knots, system, folded, least)
     return bounds[:3]

@@ -1,10 +1,7 @@
-"""Kernels are compiled by two processes where there are two cores, and by one where that fails."""
+"""A process beside this one compiles kernels, and does nothing where that is impossible or not needed."""
 
 from __future__ import annotations
 
-import json
-import os
-import subprocess
 import sys
 import time
 from collections.abc import Callable
@@ -14,40 +11,6 @@ import pytest
 from numba.core import event
 
 from mn_onnx.second_compiler import COMPILING, compiling_beside
-
-# Without a guard by __name__, as users write them.
-SCRIPT = """
-import json
-
-from mn_onnx.extract import edges, invariants, measures, sampling, weld
-from mn_onnx.extract.kernels import march
-from mn_onnx.warmup import warm_up
-
-surface = warm_up(threads=2)
-kernels = [march.march, weld._find_first_points, edges._pair_partitions, measures._measure, sampling._place]
-compiled = {kernel.__name__: sum(kernel.stats.cache_misses.values()) for kernel in kernels}
-print(json.dumps({"volume": surface.measures.volumes.sum(), "compiled": compiled}))
-"""
-
-
-def test_two_processes_compile_every_kernel_once(tmp_path: Path) -> None:
-    script = tmp_path / "script.py"
-    script.write_text(SCRIPT)
-    cache = tmp_path / "cache"
-    environment = os.environ | {"NUMBA_CACHE_DIR": str(cache)}
-    command = [sys.executable, str(script)]
-    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
-    found = json.loads(done.stdout)
-    assert found["volume"] == pytest.approx(1 / 6)  # of the octahedron
-    assert found["compiled"] == {
-        "march": 1, "_find_first_points": 0, "_pair_partitions": 0, "_measure": 0, "_place": 0,
-    }  # fmt: skip
-    # numba numbers the files of a kernel. A second one is for other types of arguments: a constant among them, or types
-    # in which the second process compiles what the first calls in others, or never.
-    files = [file.name for file in cache.glob("kernels_*/*.nbc")]
-    assert len(files) > 50
-    assert [name for name in files if not name.endswith(".1.nbc")] == []
 
 
 @pytest.fixture

@@ -2,11 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import subprocess
-import sys
-from pathlib import Path
-
 import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -108,27 +103,3 @@ def test_eight_rows_settle_as_single_ones(n_units: int, seed: int, mixed: bool) 
             np.testing.assert_allclose(x8[region, :n_units], x1[region, :n_units], rtol=1e-9, atol=1e-12)
         for region in range(memory.OUTPUTS, memory.OUTPUTS + 5):
             np.testing.assert_allclose(x8[region, : eight[2]], x1[region, : eight[2]], rtol=1e-9, atol=1e-12)
-
-
-SCRIPT = """
-import mn_onnx
-from numba.core.registry import cpu_target
-
-assert "+avx512f" not in cpu_target.target_context.codegen().magic_tuple()[2]
-surface = mn_onnx.extract({model!r}, threads=1)
-print(surface.n_polygons, surface.n_vertices, surface.unmatched.size)
-"""
-
-
-def test_machines_without_wide_registers_find_the_same(tmp_path: Path) -> None:
-    model = Path(__file__).parents[1] / "models" / "niq_fox.onnx"
-    machine = {"NUMBA_CPU_NAME": "generic", "NUMBA_CACHE_DIR": str(tmp_path)}
-    done = subprocess.run(
-        [sys.executable, "-c", SCRIPT.format(model=str(model))],
-        env=os.environ | machine,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert done.returncode == 0, done.stderr
-    assert done.stdout.split() == ["28316", "28314", "0"]

@@ -45,7 +45,8 @@ from oracle.random_networks import random_tables
 
 Floats = NDArray[np.float64]
 LOWER, UPPER = np.array([0.1, -0.3, 0.2]), np.array([0.3, -0.1, 0.4])
-M = 1024
+# Of numpy's: for constants of Python's, numba would compile the kernels once more.
+M, ROOT_SYSTEM, NO = np.int64(1024), np.int64(0), np.bool_(False)
 
 
 Arrays = tuple[NDArray[Any], ...]
@@ -79,8 +80,8 @@ class _Slices(NamedTuple):
 @njit  # type: ignore[untyped-decorator]
 def _bound_cell(F: Any, N: Any, X: Any, J: Any, tables: Any, root: int, cell: int) -> tuple[float, float, float]:
     load_states(N, J, M, root, N[SYS_ROWS])
-    bound_units(F, N, X, J, M, tables, cell, 0, 0, 0, False, False)
-    low, high, slack = bound_output(F, N, X, M, tables.extent, cell, 0, 0, -1.0)
+    bound_units(F, N, X, J, M, tables, cell, ROOT_SYSTEM, ROOT_SYSTEM, ROOT_SYSTEM, NO, NO)
+    low, high, slack = bound_output(F, N, X, M, tables.extent, cell, ROOT_SYSTEM, ROOT_SYSTEM, -1.0)
     return low, high, slack
 
 
@@ -110,11 +111,12 @@ def _bound(
     _bound_cell(F, N, X, J, tables, root, root)
     # Whatever rows the cell settles, slices are given none of it.
     load_states(N, J, M, root, N[SYS_ROWS])
-    count = bound_rows(F, N, S, J, K, M, tables, 0, 0)
-    lows, highs, slacks = bound_slice_outputs(F, N, S, K, M, tables.extent, 0, 0, count)
+    count = bound_rows(F, N, S, J, K, M, tables, ROOT_SYSTEM, ROOT_SYSTEM)
+    lows, highs, slacks = bound_slice_outputs(F, N, S, K, M, tables.extent, ROOT_SYSTEM, ROOT_SYSTEM, count)
     for k in range(SLICES):
         together[k] = lane(lows, k), lane(highs, k), lane(slacks, k)
-    return low, thickness, slack, missed_slices(F, N, S, J, K, M, tables, 0, 0), placed
+    missed = missed_slices(F, N, S, J, K, M, tables, ROOT_SYSTEM, ROOT_SYSTEM)
+    return low, thickness, slack, missed, placed
 
 
 def _slices(packed: Packed) -> _Slices:

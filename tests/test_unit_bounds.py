@@ -35,6 +35,8 @@ from oracle.random_networks import random_tables
 
 Floats = NDArray[np.float64]
 LOWER, UPPER = np.array([0.1, -0.3, 0.2]), np.array([0.3, -0.1, 0.4])
+# Of numpy's: for constants of Python's, numba would compile the kernels once more.
+FIRST, NO = np.int64(0), np.bool_(False)
 
 
 @njit  # type: ignore[untyped-decorator]
@@ -42,13 +44,13 @@ def _bound(F: Any, N: Any, X: Any, J: Any, tables: Any, cell: int, scratch: int,
     M = X.size // X_REGIONS
     f, n, x, j = pointer(F), pointer(N), pointer(X), pointer(J)
     load_states(n, j, M, cell, N[SYS_ROWS])
-    _, _, _, radius = bound_units(f, n, x, j, M, point_at_tables(tables), cell, 0, 0, scratch, tracked, False)
+    _, _, _, radius = bound_units(f, n, x, j, M, point_at_tables(tables), cell, FIRST, FIRST, scratch, tracked, NO)
     return radius
 
 
 @njit  # type: ignore[untyped-decorator]
 def _bound_backwards(F: Any, N: Any, X: Any) -> float:
-    return bound_output_form(pointer(F), pointer(N), pointer(X), X.size // X_REGIONS, 0, 0)
+    return bound_output_form(pointer(F), pointer(N), pointer(X), X.size // X_REGIONS, FIRST, FIRST)
 
 
 def _bounded(packed: Packed, tracked: bool) -> tuple[Floats, Floats, int, float]:
