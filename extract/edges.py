@@ -14,6 +14,7 @@ from mn_onnx.extract.blocks import BLOCK_SIZE, FINE_BLOCK, Indices, block_count,
 _MAX_PARTITIONS = 1 << 16  # their numbers fit in uint16
 _CORNERS_PER_PARTITION = 1 << 13  # whose counters fit in the cache of a core
 _FEW = 32  # half-edges, or corners, that are compared with one another
+_LATER = -2  # instead of the twin of a half-edge that is to be paired by sorting
 
 
 def half_edge_heads(offsets: NDArray[np.int64], corners: Indices) -> Indices:
@@ -135,23 +136,6 @@ def _in_one_polygon(offsets: NDArray[np.int64], corner: int, other: int) -> bool
 
 
 @numba.njit(cache=True, nogil=True)
-def _pair_many(edges: NDArray[np.int64], at: Indices, offsets: NDArray[np.int64], twins: Indices) -> None:
-    """Set the twins of the corners ``at``, all of one lower end, in the time of sorting; see `_pair_partitions`."""
-    order = np.argsort(edges, kind="mergesort")  # numba's quicksort takes quadratic time on the fan around a hub
-    first = 0
-    for item in range(edges.size):
-        if item + 1 < edges.size and edges[order[item + 1]] >> 1 == edges[order[first]] >> 1:
-            continue
-        for member in range(first, item + 1):
-            twins[at[order[member]]] = -1
-        corner, twin = at[order[first]], at[order[item]]
-        opposite = edges[order[first]] ^ 1 == edges[order[item]]
-        if item == first + 1 and opposite and not _in_one_polygon(offsets, corner, twin):
-            twins[corner], twins[twin] = twin, corner
-        first = item + 1
-
-
-@numba.njit(cache=True, nogil=True)
 def _pair_partitions(
     offsets: NDArray[np.int64],
     corners: Indices,
@@ -166,7 +150,8 @@ def _pair_partitions(
 ) -> None:
     """Pair the half-edges of partitions ``first .. last``, sorted by their lower ends.
 
-    ``folded``: whether there may be polygons that run along an edge twice.
+    ``folded``: whether there may be polygons that run along an edge twice. Half-edges at vertices that are the lower
+    end of more than a few get `_LATER`.
     """
     for partition in range(first, last):
         begin, count = starts[partition], starts[partition + 1] - starts[partition]
@@ -192,7 +177,8 @@ def _pair_partitions(
         for vertex in range(1 << shift):
             bucket_end = ends[vertex]
             if bucket_end - bucket > _FEW:
-                _pair_many(edges[bucket:bucket_end], at[bucket:bucket_end], offsets, twins)
+                for item in range(bucket, bucket_end):
+                    twins[at[item]] = _LATER
                 bucket = bucket_end
             for item in range(bucket, bucket_end):
                 # Which half-edges meet is as good as random, so nothing branches on it.
@@ -207,6 +193,21 @@ def _pair_partitions(
                     paired = paired and not _in_one_polygon(offsets, corner, twin)
                 twins[corner] = twin if paired else -1
             bucket = bucket_end
+
+
+def _pair_sorted(left: Indices, offsets: NDArray[np.int64], corners: Indices, heads: Indices, twins: Indices) -> None:
+    """Set the twins of the corners ``left`` as `_pair_partitions` does, in the time of sorting."""
+    tails, ends = corners[left], heads[left]
+    lower, upper, turned = np.minimum(tails, ends), np.maximum(tails, ends), tails > ends
+    order = np.lexsort((turned, upper, lower))
+    left, lower, upper, turned = left[order], lower[order], upper[order], turned[order]
+    twins[left] = -1
+    changes = np.flatnonzero((lower[1:] != lower[:-1]) | (upper[1:] != upper[:-1])) + 1
+    starts = np.concatenate([[0], changes])
+    pairs = starts[np.diff(starts, append=left.size) == 2]
+    polygons = np.searchsorted(offsets, left, side="right")
+    pairs = pairs[(turned[pairs] != turned[pairs + 1]) & (polygons[pairs] != polygons[pairs + 1])]
+    twins[left[pairs]], twins[left[pairs + 1]] = left[pairs + 1], left[pairs]
 
 
 def pair_half_edges(offsets: NDArray[np.int64], corners: Indices, n_vertices: int, threads: int) -> Indices:
@@ -239,4 +240,7 @@ def pair_half_edges(offsets: NDArray[np.int64], corners: Indices, n_vertices: in
         starts.size - 1,
         threads,
     )
+    left = np.flatnonzero(twins == _LATER)
+    if left.size:
+        _pair_sorted(left, offsets, corners, heads, twins)
     return twins
