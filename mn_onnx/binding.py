@@ -52,7 +52,12 @@ def graph_inputs(model: onnx.ModelProto) -> list[GraphInput]:
         sizes = [
             axis.dim_value if axis.HasField("dim_value") and axis.dim_value > 0 else None for axis in kind.shape.dim
         ]
-        dtype = np.dtype(onnx.helper.tensor_dtype_to_np_dtype(kind.elem_type))
+        try:
+            dtype = np.dtype(onnx.helper.tensor_dtype_to_np_dtype(kind.elem_type))
+        except KeyError:
+            reason = f"its element type {kind.elem_type} is none that ONNX defines"
+            problems.append(_problem(value.name, reason, "export the model again"))
+            continue
         free = tuple(axis.dim_param for axis in kind.shape.dim)
         if not kind.HasField("shape"):
             # Without a declared rank, points [N, d] are assumed.
@@ -104,7 +109,7 @@ def bind_inputs(
     for key, value in bind.items():
         name, spec = _parse_key(key, by_name)
         if spec is None:
-            values[name] = np.asarray(value)
+            values[name] = _numbers(key, value)
         else:
             entry = columns.setdefault(name, _Columns())
             entry.bound.update(_column_values(key, by_name[name], spec, value))
@@ -154,7 +159,7 @@ def _column_values(key: str, entry: GraphInput, spec: str, value: ArrayLike) -> 
     if axis is None:
         raise UsageError(f"input {entry.name!r} has no columns to bind: its shape is {_show(entry)}")
     columns = _columns_of(spec, entry.shape[axis] or 0, key)
-    given = np.asarray(value, np.float64).reshape(-1)
+    given = _numbers(key, value).astype(np.float64).reshape(-1)
     if given.size not in (1, len(columns)):
         raise UsageError(f"{key!r} names {len(columns)} columns, but {given.size} values were given")
     return dict(zip(columns, np.broadcast_to(given, len(columns)).tolist(), strict=True))
@@ -221,8 +226,25 @@ def coordinate_axis(entry: GraphInput, *, wide: bool = False) -> int | None:
     return None
 
 
+def _numbers(key: str, value: ArrayLike) -> np.ndarray:
+    try:
+        numbers = np.asarray(value)
+    except ValueError:  # rows of several lengths
+        numbers = np.asarray(None)
+    if numbers.dtype.kind not in "biuf" and not is_float(numbers.dtype):
+        raise UsageError(f"{key!r} is bound to something else than numbers: {value!r}")
+    return numbers
+
+
 def _bound_input(entry: GraphInput, value: np.ndarray) -> BoundInput:
-    value = np.asarray(value, np.float64) if is_float(entry.dtype) else np.asarray(value)
+    if is_float(entry.dtype):
+        value = value.astype(np.float64)
+    else:
+        with np.errstate(invalid="ignore"):  # of NaN, and numbers too large for the type: they come back as others
+            converted = value.astype(entry.dtype)
+        if not np.array_equal(converted, value):
+            raise UsageError(f"input {entry.name!r} takes {entry.dtype.name} numbers, but is bound to {value.tolist()}")
+        value = converted
     shape = list(entry.shape)
     for back in range(1, min(len(shape), value.ndim) + 1):
         if shape[-back] is None and value.shape[-back] != 1:

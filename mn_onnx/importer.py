@@ -9,7 +9,6 @@ from typing import TypedDict, Unpack
 
 import numpy as np
 import onnx
-import onnx.inliner
 from numpy.typing import ArrayLike
 
 from mn_onnx.binding import GraphInput, bind_inputs, graph_inputs, has_free_width, input_of_key, with_width
@@ -20,6 +19,7 @@ from mn_onnx.ir.substitute import with_fixed_inputs
 from mn_onnx.layout import BoundInput, Layout, Output, PointInput, parameter_values, point_count
 from mn_onnx.lowering import LOWERINGS, REFUSALS
 from mn_onnx.lowering.context import Context, Scope
+from mn_onnx.reader.functions import inline_functions
 from mn_onnx.reader.structure import opset_versions
 from mn_onnx.symbolic import (
     NO_POINT,
@@ -131,7 +131,7 @@ def import_family(model: onnx.ModelProto, parameters: Collection[str], **options
     linear only once its value is known.
     """
     if model.functions:
-        model = onnx.inliner.inline_local_functions(model)
+        model = inline_functions(model)
     inputs, bound, coordinates = graph_inputs(model), options.get("bind") or {}, options.get("coordinates")
     choices = [with_width(inputs, width) for width in WIDTHS] if has_free_width(inputs, bound) else [inputs]
     refusals = []

@@ -50,9 +50,11 @@ def _strip(program: Program) -> Program | None:
         return None
     index, function, weight, bias = head
     unit = program.network.units[index]
-    inverse = _invert(program, index, function, (program.level - bias) / weight)
+    target = (program.level - bias) / weight
+    inverse = _invert(program, index, function, target)
     if inverse.reason:
-        described = f"{unit.name}: the level {program.level:.9g} is not reached: {inverse.reason}"
+        value = "" if target == program.level else f", where it would be {target:.9g},"
+        described = f"{unit.name}: the level {program.level:.9g}{value} is not reached: {inverse.reason}"
         return replace(program, empty_reason=described)
     if inverse.direction == 0:
         return None

@@ -28,7 +28,7 @@ CALLS = 1 << 14
 
 _REMEDY = "--no-check extracts without a comparison"
 
-_ORT_REFUSALS = (
+ORT_REFUSALS = (
     ort_errors.Fail,
     ort_errors.InvalidArgument,
     ort_errors.InvalidGraph,
@@ -36,6 +36,7 @@ _ORT_REFUSALS = (
     ort_errors.NotImplemented,
     ort_errors.RuntimeException,
 )
+"""What onnxruntime raises on models and inputs that it cannot run."""
 
 
 class Runtime:
@@ -56,7 +57,7 @@ class Runtime:
         try:
             self._run = _onnxruntime(read.original, layout.output.name, threads)
             self.name = f"onnxruntime {onnxruntime.__version__}"
-        except _ORT_REFUSALS as error:
+        except ORT_REFUSALS as error:
             self.note = f"onnxruntime cannot run this model ({str(error).splitlines()[0]})"
             self._run = _reference(read.original, layout.output.name, self.note)
             self.name = f"onnx.reference {onnx.__version__}"
@@ -73,13 +74,18 @@ class Runtime:
         return values
 
 
-def _onnxruntime(model: onnx.ModelProto, output: str, threads: int | None) -> Run:
+def open_session(model: onnx.ModelProto, *, threads: int | None = None) -> onnxruntime.InferenceSession:
+    """A session of onnxruntime for the model; raises `ORT_REFUSALS`. ``threads``: by default as it sees fit."""
     options = onnxruntime.SessionOptions()
-    options.intra_op_num_threads = threads or 0  # 0: as onnxruntime sees fit
+    options.intra_op_num_threads = threads or 0
     options.log_severity_level = 4  # what goes wrong arrives as an exception
+    return onnxruntime.InferenceSession(model.SerializeToString(), options, ["CPUExecutionProvider"])
+
+
+def _onnxruntime(model: onnx.ModelProto, output: str, threads: int | None) -> Run:
     try:
-        session = onnxruntime.InferenceSession(model.SerializeToString(), options, ["CPUExecutionProvider"])
-    except _ORT_REFUSALS:
+        session = open_session(model, threads=threads)
+    except ORT_REFUSALS:
         # The file format's version says what a file may contain; an older one that allows these operator sets will do.
         oldest = onnx.helper.find_min_ir_version_for(list(model.opset_import), ignore_unknown=True)
         if model.ir_version <= oldest:
@@ -87,12 +93,12 @@ def _onnxruntime(model: onnx.ModelProto, output: str, threads: int | None) -> Ru
         older = onnx.ModelProto()
         older.CopyFrom(model)
         older.ir_version = oldest
-        session = onnxruntime.InferenceSession(older.SerializeToString(), options, ["CPUExecutionProvider"])
+        session = open_session(older, threads=threads)
 
     def run(feeds: Feeds) -> Mapping[str, NDArray[Any]]:
         try:
             return {output: session.run([output], feeds)[0]}
-        except _ORT_REFUSALS as error:
+        except ORT_REFUSALS as error:
             raise CheckFailed([f"onnxruntime stopped while evaluating the model: {error}"]) from error
 
     return run

@@ -162,7 +162,7 @@ def cast_like(context: Context, node: Node) -> Constant | Tensor:
 def convert(context: Context, x: Constant | Tensor, dtype: np.dtype) -> Constant | Tensor:
     """Change the type. Constants are rounded as in the graph; data stay real numbers, whatever their float type."""
     if isinstance(x, Constant):
-        return Constant.of(x.array.astype(dtype), dtype)
+        return Constant.of(x.declared.astype(dtype), dtype)
     if x.dtype == BOOL:
         number = x if dtype == BOOL else context.algebra.unary(x, formulas.truth_as_number)
         return number.with_dtype(dtype)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -125,10 +126,12 @@ class Context:
         inputs = [self._read(scope, name) if name else None for name in proto.input]
         while inputs and inputs[-1] is None:
             inputs.pop()
-        node = Node(proto, domain, self.opsets.get(domain, 0), label, inputs, decode_attributes(proto))
-        self._ops[label] = (f"{domain}::{proto.op_type}" if domain else proto.op_type, node.version)
+        version = self.opsets.get(domain, 0)
+        self._ops[label] = (f"{domain}::{proto.op_type}" if domain else proto.op_type, version)
         self.algebra.node = label
+        node = Node(proto, domain, version, label, inputs)
         try:
+            node = replace(node, attributes=decode_attributes(proto))
             outputs = self._lower(node)
         except OpaqueInput as error:
             return self._opaque(node, error.problems)
@@ -151,6 +154,8 @@ class Context:
         key = (node.domain, node.op)
         refusal = self._refusals.get(key)
         entry = self._entry(node)
+        if entry is None and key in self._lowerings:
+            raise self._unknown_operator(node)  # nor can constants be trusted to a definition that old
         if (entry is None or not entry.on_constants) and not (refusal and refusal.never_fold) and node.inputs:
             given = [value for value in node.inputs if value is not None]
             if all(isinstance(value, Constant) for value in given):

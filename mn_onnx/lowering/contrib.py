@@ -139,7 +139,12 @@ def imputer(_context: Context, node: Node) -> Constant | Tensor:
 def feature_vectorizer(_context: Context, node: Node) -> Constant | Tensor:
     """The inputs side by side, as real numbers."""
     parts = [lift(node.tensor(index)).with_dtype(FLOAT32) for index in range(len(node.inputs))]
-    return concatenate([part.reshape(part.shape[0], -1) for part in parts], 1)
+    parts = [part.reshape(part.shape[0], -1) for part in parts]
+    widths = [part.shape[1] for part in parts]
+    declared = list(node.attribute("inputdimensions", widths))
+    if declared != widths:
+        raise UnsupportedNode(f"inputdimensions {declared} are not the widths of its inputs, {widths}")
+    return concatenate(parts, 1)
 
 
 MICROSOFT: Table = {

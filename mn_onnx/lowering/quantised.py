@@ -53,6 +53,10 @@ def matmul_of_packed_weights(context: Context, node: Node) -> Constant | Tensor:
     """MatMulNBits of onnxruntime: ``x @ W.T + bias``, with weights in blocks of ``block_size`` along their rows."""
     columns, rows = int(node.attribute("K")), int(node.attribute("N"))
     bits, block = int(node.attribute("bits", 4)), int(node.attribute("block_size"))
+    if int(node.attribute("accuracy_level", 0)) == 4:
+        raise UnsupportedNode(
+            "accuracy_level 4 rounds its data to 8 bits", "quantise with accuracy_level 0 or 1, or export before that"
+        )
     if bits not in (2, 4, 8) or node.has(4):
         raise UnsupportedNode(
             f"weights of {bits} bits{' with a group index' if node.has(4) else ''} are not supported",

@@ -30,9 +30,10 @@ def reduce(reducer: Reducer, axes_input_since: int) -> Callable[[Context, Node],
         x = lift(node.tensor(0))
         rank = len(x.shape)
         axes = node.integers(1, "axes", "list of axes") if node.version >= axes_input_since else node.attribute("axes")
-        if not axes and node.attribute("noop_with_empty_axes", 0):
-            return x
-        chosen = sorted({normal_axis(axis, rank) for axis in axes}) if axes else list(range(rank))
+        if axes:
+            chosen = sorted({normal_axis(axis, rank) for axis in axes})
+        else:  # of no axes, what is done to every element before and after summing is still done
+            chosen = [] if node.attribute("noop_with_empty_axes", 0) else list(range(rank))
         kept = [axis for axis in range(rank) if axis not in chosen]
         moved = x.map(lambda field: np.transpose(field, kept + chosen))
         count = math.prod(x.shape[axis] for axis in chosen)
@@ -187,6 +188,8 @@ def top_k(context: Context, node: Node) -> tuple[Tensor | Opaque, ...]:
     """The largest or smallest elements by a sorting network; their positions stay unknown."""
     x = lift(node.tensor(0))
     axis = normal_axis(int(node.attribute("axis", -1)), len(x.shape))
+    if not node.attribute("sorted", 1):
+        raise UnsupportedNode("it gives the elements in no defined order (sorted=0)", "export with sorted=True")
     k = int(np.ravel(node.constant(1, "count"))[0]) if node.has(1) else int(node.attribute("k", 1))
     width = x.shape[axis]
     if not 0 <= k <= width:

@@ -136,8 +136,9 @@ def _slice(
         axis = normal_axis(axis, len(x.shape))
         size = x.shape[axis]
         # ONNX clamps to the axis where Python, going backwards, would read -1 as the last element.
-        low, high = (0, size) if step > 0 else (-1, size - 1)
-        start, end = (min(max(n + size if n < 0 else n, low), high) for n in (start, end))
+        last, before = (size, 0) if step > 0 else (size - 1, -1)
+        start = min(max(start + size if start < 0 else start, 0), last)
+        end = min(max(end + size if end < 0 else end, before), last)
         index[axis] = slice(start, end if end >= 0 else None, step)
     return rearrange(x, lambda array: array[tuple(index)])
 
@@ -270,8 +271,9 @@ def space_to_depth(_context: Context, node: Node) -> Movable:
     n, c, h, w = x.shape
     block = int(node.attribute("blocksize"))
     split_shape = (n, c, h // block, block, w // block, block)
+    order = (0, 3, 5, 1, 2, 4) if node.attribute("mode", "DCR") == "DCR" else (0, 1, 3, 5, 2, 4)
     merged = (n, c * block**2, h // block, w // block)
-    return rearrange(x, lambda array: array.reshape(split_shape).transpose(0, 3, 5, 1, 2, 4).reshape(merged))
+    return rearrange(x, lambda array: array.reshape(split_shape).transpose(order).reshape(merged))
 
 
 LOWERINGS: Table = {

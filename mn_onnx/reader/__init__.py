@@ -8,14 +8,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import onnx
-import onnx.inliner
 
 from mn_onnx.errors import ModelRefused, Problem, UsageError
 from mn_onnx.reader.formats import PROTOBUF_LIMIT, decode
+from mn_onnx.reader.functions import inline_functions
 from mn_onnx.reader.structure import interface_problems, node_problems, opset_problems, opset_versions, sort_nodes
 from mn_onnx.reader.tensors import (
-    densify_constants,
-    densify_initializers,
+    densify,
     embed_external_data,
     model_tensors,
     tensor_problem,
@@ -76,7 +75,7 @@ def read_model(source: ModelSource) -> ReadModel:
     if problems:
         raise ModelRefused(problems)
     _lower_ir_version(original)
-    problems += densify_initializers(original.graph) + densify_constants(original.graph)
+    problems += densify(original.graph)
     model = _inline_functions(original) if original.functions else original
     problems += interface_problems(model.graph)
     problems += sort_nodes(model.graph, opset_versions(model))
@@ -87,14 +86,17 @@ def read_model(source: ModelSource) -> ReadModel:
 
 
 def _read_file(path: Path) -> bytes:
-    if path.is_dir():
-        raise UsageError(f"{path} is a folder; pass the .onnx file (TensorFlow models: convert with tf2onnx)")
     try:
         return path.read_bytes()
+    except IsADirectoryError as error:
+        reason = f"{path} is a folder; pass the .onnx file (TensorFlow models: convert with tf2onnx)"
+        raise UsageError(reason) from error
     except FileNotFoundError as error:
         raise UsageError(f"there is no model file {path}") from error
     except OSError as error:
         raise UsageError(f"cannot read the model file {path}: {error.strerror}") from error
+    except ValueError as error:  # a path with a null character
+        raise UsageError(f"{str(path)!r} is no path of a model file: {error}") from error
 
 
 def _tensor_problems(model: onnx.ModelProto) -> list[Problem]:
@@ -113,7 +115,7 @@ def _lower_ir_version(model: onnx.ModelProto) -> None:
 
 def _inline_functions(model: onnx.ModelProto) -> onnx.ModelProto:
     try:
-        return onnx.inliner.inline_local_functions(model, convert_version=True)
+        return inline_functions(model)
     except (RuntimeError, ValueError, onnx.checker.ValidationError) as error:
         names = ", ".join(f"{function.domain}::{function.name}" for function in model.functions)
         reason = f"its model-local functions ({names}) cannot be inlined: {str(error).splitlines()[0]}"

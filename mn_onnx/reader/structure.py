@@ -38,9 +38,8 @@ def opset_problems(model: onnx.ModelProto) -> list[Problem]:
         problems.append(Problem("", "", 0, reason, "export with an older opset_version, or update mn-onnx"))
     counts = Counter("" if entry.domain == "ai.onnx" else entry.domain for entry in model.opset_import)
     for domain in sorted(domain for domain, count in counts.items() if count > 1):
-        found = sorted(
-            {entry.version for entry in model.opset_import if entry.domain.removeprefix("ai.onnx") == domain}
-        )
+        same = {domain, "ai.onnx" if domain == "" else domain}
+        found = sorted({entry.version for entry in model.opset_import if entry.domain in same})
         if len(found) > 1:
             reason = f"the operator set {domain or 'ai.onnx'!r} is imported in several versions: {found}"
             problems.append(Problem("", "", 0, reason, _EXPORT_AGAIN))
@@ -121,6 +120,15 @@ def node_problems(graph: onnx.GraphProto, model: onnx.ModelProto) -> list[Proble
             reason = f"the model imports no version of the operator set {domain or 'ai.onnx'!r}"
             problems.append(_problem(node, opsets, reason))
         elif not inner and onnx.defs.has(node.op_type, domain=domain, max_inclusive_version=version):
+            formals = onnx.defs.get_schema(node.op_type, version, domain).inputs
+            if (
+                formals
+                and formals[-1].option == onnx.defs.OpSchema.FormalParameterOption.Variadic
+                and not all(node.input[len(formals) - 1 :])
+            ):
+                reason = f"one of the inputs that {node.op_type} takes any number of has no name"
+                problems.append(_problem(node, opsets, reason))
+                continue
             try:
                 onnx.checker.check_node(node, context)
             except onnx.checker.ValidationError as error:
@@ -167,9 +175,10 @@ def _reads(node: onnx.NodeProto) -> Iterator[str]:
     """The tensors a node reads, those that the graphs inside it take from around them included."""
     yield from _own_reads(node)
     for inner in _inner_graphs(node):
-        for part in inner.node:
-            yield from _reads(part)
-        yield from (value.name for value in inner.output)
+        own = {value.name for value in inner.input} | {tensor.name for tensor in inner.initializer}
+        own.update(name for part in inner.node for name in part.output)
+        read = {name for part in inner.node for name in _reads(part)} | {value.name for value in inner.output}
+        yield from sorted(read - own)
 
 
 def _reads_later(graph: onnx.GraphProto, producer: Mapping[str, int]) -> Iterator[bool]:

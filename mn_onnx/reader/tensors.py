@@ -151,7 +151,17 @@ def _is_float(data_type: int) -> bool:
     return data_type in (types.FLOAT, types.DOUBLE, types.FLOAT16, types.BFLOAT16)
 
 
-def densify_initializers(graph: onnx.GraphProto) -> list[Problem]:
+def densify(graph: onnx.GraphProto) -> list[Problem]:
+    """Make the sparse tensors of ``graph`` dense, and those of the graphs inside it; returns the problems found."""
+    problems = _densify_initializers(graph) + _densify_constants(graph)
+    for node in graph.node:
+        for attribute in node.attribute:
+            for inner in [attribute.g, *attribute.graphs] if attribute.HasField("g") else attribute.graphs:
+                problems += densify(inner)
+    return problems
+
+
+def _densify_initializers(graph: onnx.GraphProto) -> list[Problem]:
     """Replace the sparse initializers of ``graph`` by dense ones; returns the problems of those that cannot be."""
     problems: list[Problem] = []
     for sparse in graph.sparse_initializer:
@@ -167,7 +177,7 @@ def densify_initializers(graph: onnx.GraphProto) -> list[Problem]:
     return problems
 
 
-def densify_constants(graph: onnx.GraphProto) -> list[Problem]:
+def _densify_constants(graph: onnx.GraphProto) -> list[Problem]:
     """Replace the ``sparse_value`` of Constant nodes by a dense ``value``; returns the problems found."""
     problems: list[Problem] = []
     for node in graph.node:

@@ -59,6 +59,11 @@ class Constant:
     def shape(self) -> tuple[int, ...]:
         return self.array.shape
 
+    @property
+    def declared(self) -> Array:
+        """The values as the graph has them: real numbers rounded to their type."""
+        return self.array.astype(self.dtype)
+
 
 @dataclass(frozen=True, eq=False)
 class Opaque:
