@@ -305,6 +305,12 @@ class _Pool:
         with self.condition:
             self.error = self.error or error
             self.condition.notify_all()
+        self.stop()
+
+    def stop(self) -> None:
+        """Tell all workers to stop."""
+        for worker in self.workers:
+            worker.control[entries.STOP] = 1
 
 
 def traverse(
@@ -317,9 +323,10 @@ def traverse(
 ) -> tuple[PolygonSoup, TraversalStatistics]:
     """Find every polygon of the level set f = 0 of a canonical network in a box.
 
-    ``lower``, ``upper``: float64 [3]. ``threads``: number of worker threads, all cores by default; the result does not
-    depend on it. ``progress`` is called from the calling thread a few times a second, and once at the end; what it
-    raises stops the workers and is passed on.
+    ``lower``, ``upper``: float64 [3]. ``threads``: number of worker threads, all cores by default. The polygons do not
+    depend on it; at which of several points of one key, apart by rounding, a corner lies may. ``progress`` is called
+    from the calling thread a few times a second, and once at the end; what it raises stops the workers and is passed
+    on.
 
     Raises ``ValueError`` for a network that is not canonical, an empty box or fewer than one thread. An interrupt
     (KeyboardInterrupt) stops all workers and is passed on.
@@ -352,16 +359,18 @@ def traverse(
             progress(Progress(nodes, polygons, corners))
 
     crew = [threading.Thread(target=work, args=(number,), daemon=True) for number in range(count)]
-    for thread in crew:
-        thread.start()
+    started = []
     try:
-        while any(thread.is_alive() for thread in crew):
-            next(thread for thread in crew if thread.is_alive()).join(0.2)
-            report()
-    finally:
-        for worker in workers:
-            worker.control[entries.STOP] = 1
         for thread in crew:
+            thread.start()
+            started.append(thread)
+        for thread in crew:
+            while thread.is_alive():
+                thread.join(0.2)
+                report()
+    finally:
+        pool.stop()
+        for thread in started:
             thread.join()
     if pool.error is not None:
         raise pool.error

@@ -343,7 +343,7 @@ def march(worker, tables, output, budget):
         visit(F, N, X, J, M, control, stack, buffers, knots, S, K, slot_of_tag, cell)
         bin_ = 0
         units = N[system + SYS_UNITS]
-        while units > 0:
+        while units > 0 and bin_ < PROFILE_BINS - 1:
             bin_ += 1
             units >>= 1
         layers = min(levels, PROFILE_BINS - 1)

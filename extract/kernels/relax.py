@@ -52,7 +52,10 @@ def relax_one_knot(knot, left, left_at, right, right_at, low, high, above, under
     """
     zero, half, minus = splat_wide(0.0), splat_wide(0.5), splat_wide(-1.0)
     at_low = fma(left, low, left_at)
-    chord = divide(fma(minus, at_low, fma(right, high, right_at)), fma(minus, low, high))
+    at_high = fma(right, high, right_at)
+    # Halves, which are finite where the ends are.
+    less = fma(minus, half, zero)
+    chord = divide(fma(less, at_low, fma(half, at_high, zero)), fma(less, low, fma(half, high, zero)))
     deviation = fma(minus, at_low, fma(left, knot, left_at))
     deviation = fma(fma(minus, low, knot), fma(minus, chord, zero), deviation)
     middle = fma(half, deviation, fma(fma(minus, chord, zero), low, at_low))
@@ -70,7 +73,7 @@ def relax_piece_range(knots, slopes, intercepts, knot, piece, first, last, low, 
     """
     at_low = slopes[piece + first] * low + intercepts[piece + first]
     at_high = slopes[piece + last] * high + intercepts[piece + last]
-    slope = (at_high - at_low) / (high - low)
+    slope = (0.5 * at_high - 0.5 * at_low) / (0.5 * high - 0.5 * low)
     above, below = 0.0, 0.0
     for s in range(first, last):
         kappa = knots[knot + s]

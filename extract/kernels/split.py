@@ -33,6 +33,7 @@ from mn_onnx.extract.kernels.memory import (
     KIND,
     LOW,
     RADIUS,
+    SIDE_COUNTS,
     STATE_HIGH,
     STATE_LOW,
     SYS_HEADER,
@@ -137,6 +138,9 @@ def split_cell(F, N, X, J, M, control, stack, tables, slot_of_tag, cell, cell_ro
         return
     rows, depth = N[system + SYS_ROWS], N[cell + CELL_DEPTH] + 1
     for side in (1, 0):
+        # The plane may miss the cell by rounding: a knot is compared otherwise here than where it was chosen.
+        if J[SIDE_COUNTS * M + side] == 0:
+            continue
         part = control[TOP_I]
         vertices = write_half(F, N, X, J, M, cell, cell_rows, rows, count, side, 2 * plane + side, part, control[TOP_F])
         low = knot + 1 if side == 1 else J[STATE_LOW * M + row]
@@ -160,7 +164,7 @@ def write_part(F, N, X, J, M, control, cell, rows, part_rows, count, side, tag):
 
 @njit(cache=True, error_model="numpy")
 def cut_away(F, N, X, J, M, control, slot_of_tag, cell, rows, sign, reach, tag):
-    """The part of the cell where ``sign * c(x) >= -reach``, c the output's centre, as a polytope without states.
+    """The part of the cell where ``sign * c(x) >= -reach``, c the output's centre, with room for the cell's states.
 
     The cell itself if the plane misses it, or if it is too degenerate to be cut: trimming is never needed.
     """
