@@ -39,10 +39,11 @@ class Degeneracy:
     """What was degenerate about a network in its box, and what was done about it.
 
     ``found``: sentences that say why the exact traversal could not be trusted; empty where it could.
-    ``perturbation``: the relative size of the shifts under which the mesh was found, None if none was needed; the
-    vertices have been taken back to the network as it is. ``displacement``: the farthest any vertex was taken back.
-    ``merged_vertices``, ``removed_polygons``: what coincided or had no area. ``box_copies``: polygons in a box face,
-    which are left out unless ``only_box_copies``: there are no others. ``attempts``: perturbations tried.
+    ``perturbation``: the relative size of the shifts under which the mesh was found, None if none was needed, or none
+    gave a better mesh; the vertices have been taken back to the network as it is. ``displacement``: the farthest any
+    vertex was taken back. ``merged_vertices``, ``removed_polygons``: what coincided or had no area. ``box_copies``:
+    polygons in a box face, which are left out unless ``only_box_copies``: there are no others. ``attempts``:
+    perturbations tried.
     """
 
     found: tuple[str, ...] = ()
@@ -106,7 +107,8 @@ def extract_surface(network: Network, lower: Floats, upper: Floats, **options: U
 
     A network in general position is traversed once, as it is. Where planes coincide or meet by design, the mesh is that
     of a perturbed network in the limit of no perturbation (see `mn_onnx.extract.degeneracy.limit`). If no perturbation
-    gives a closed mesh the best one found is returned: ``surface.unmatched`` tells, and the caller must.
+    gives a closed mesh the best one found is returned: ``surface.unmatched`` and the degeneracy tell, and the caller
+    must.
 
     ``options``: see `RunOptions`. Raises ``ValueError`` for a network that is not canonical or an empty box.
     """
@@ -231,11 +233,16 @@ def _cleaned(surface: Surface, run: _Run, length: float, degeneracy: Degeneracy)
 
 
 def _perturbed(network: Network, run: _Run, size: float, seed: int) -> tuple[Surface, float] | None:
-    """The mesh in the limit of a perturbation, and the largest displacement; None if ``size`` is not small enough."""
+    """The mesh in the limit of a perturbation, and the largest displacement; None if it cannot be had with ``size``.
+
+    Because it is not small enough, or because cells under it are too degenerate to be cut.
+    """
     shifts = perturbation(network, run.lower, run.upper, size=size, seed=seed)
     soups, surfaces = [], []
     for scale in SCALES:
-        soup, _ = traverse(shifts.at(scale), run.lower, run.upper, threads=run.threads, progress=run.progress)
+        soup, statistics = traverse(shifts.at(scale), run.lower, run.upper, threads=run.threads, progress=run.progress)
+        if statistics.broken_cuts:
+            return None
         soup, _ = _whole_polygons(soup)
         soups.append(soup)
         surfaces.append(weld(soup, threads=run.threads))

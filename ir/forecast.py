@@ -76,7 +76,7 @@ def _surface_points(evaluator: Evaluator, lower: Floats, upper: Floats) -> tuple
         others = [other for other in range(dimension) if other != axis]
         extent = upper - lower
         side = round(LINES[dimension] ** (1 / max(1, len(others))))
-        grid = np.stack(np.meshgrid(*[np.arange(side)] * len(others), indexing="ij"), axis=-1).reshape(-1, len(others))
+        grid = np.array(list(np.ndindex(*[side] * len(others))), np.float64)
         grid = (grid + generator.random(grid.shape)) / side
         along = np.linspace(0.0, 1.0, STEPS + 1)
         unit = np.empty((len(grid), STEPS + 1, dimension))

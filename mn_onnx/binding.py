@@ -233,6 +233,8 @@ def _numbers(key: str, value: ArrayLike) -> np.ndarray:
         numbers = np.asarray(None)
     if numbers.dtype.kind not in "biuf" and not is_float(numbers.dtype):
         raise UsageError(f"{key!r} is bound to something else than numbers: {value!r}")
+    if not np.isfinite(numbers.astype(np.float64)).all():
+        raise UsageError(f"{key!r} is bound to numbers that are not finite")
     return numbers
 
 

@@ -1,14 +1,21 @@
 """The command line: arguments, exit codes, and nothing else, so that it starts fast. `mn_onnx.commands` does the work.
 
 Exit codes: 0 success; 2 wrong usage or a refused model; 3 a check failed or there is no level set; 4 the memory allowed
-is not enough; 130 interrupted.
+is not enough; 130 interrupted; 141 whoever read the output went away.
 """
 
 from __future__ import annotations
 
 import argparse
+import os
+import re
+import signal
 import sys
-from collections.abc import Sequence
+import threading
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from types import FrameType
+from typing import Any
 
 from mn_onnx import __version__
 from mn_onnx.errors import CheckFailed, MemoryLimitReached, MnOnnxError
@@ -17,14 +24,29 @@ EXIT_USAGE = 2
 EXIT_CHECK = 3
 EXIT_MEMORY = 4
 EXIT_INTERRUPTED = 130
+EXIT_PIPE = 141
+
+
+class _Parser(argparse.ArgumentParser):
+    """A parser that knows numbers as ``-1.``, ``-1e-3`` and ``-1,0`` from options."""
+
+    def __init__(self, *arguments: Any, **keywords: Any) -> None:
+        super().__init__(*arguments, **keywords)
+        self._negative_number_matcher = re.compile(r"-(\d+\.?\d*|\.\d+)(e[-+]?\d+)?(,.*)?$", re.IGNORECASE)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line with ``arguments`` (default: those of the process); returns the exit code."""
     options = build_parser().parse_args(arguments)
     try:
-        status: int = options.run(options)
+        with _ended_by_interrupts():
+            status: int = options.run(options)
+        sys.stdout.flush()
         return status
+    except BrokenPipeError:
+        # Whoever read the output has seen enough. Python would complain once more when it closes the pipe.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return EXIT_PIPE
     except CheckFailed as error:
         _complain(str(error))
         return EXIT_CHECK
@@ -41,6 +63,29 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         _complain("interrupted")
         return EXIT_INTERRUPTED
+    except OSError as error:
+        _complain(f"cannot print: {error.strerror or error}")
+        return EXIT_USAGE
+
+
+@contextmanager
+def _ended_by_interrupts() -> Iterator[None]:
+    """Let a request to end do what an interrupt does, so that nothing half written stays."""
+
+    def interrupt(_number: int, _frame: FrameType | None) -> None:
+        raise KeyboardInterrupt
+
+    numbers = [getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)]
+    if threading.current_thread() is not threading.main_thread():
+        numbers = []  # only there can handlers be set
+    ours = [number for number in numbers if signal.getsignal(number) == signal.SIG_DFL]
+    for number in ours:
+        signal.signal(number, interrupt)
+    try:
+        yield
+    finally:
+        for number in ours:
+            signal.signal(number, signal.SIG_DFL)
 
 
 def _extract(options: argparse.Namespace) -> int:
@@ -73,7 +118,7 @@ def _complain(message: str) -> None:
 
 def build_parser() -> argparse.ArgumentParser:
     """The parser of all commands; ``options.run`` is the function that carries the command out."""
-    parser = argparse.ArgumentParser(
+    parser = _Parser(
         prog="mn-onnx",
         description="Exact level sets of networks exported to ONNX, as welded polygon meshes.",
         epilog="Exit codes: 0 ok, 2 wrong usage or refused model, 3 failed check or empty level set, 4 memory limit "
@@ -88,7 +133,7 @@ def build_parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _add_extract(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+def _add_extract(commands: argparse._SubParsersAction[_Parser]) -> None:
     parser = commands.add_parser(
         "extract",
         help="write the level set of a model as a mesh file",
@@ -128,7 +173,7 @@ def _add_extract(commands: argparse._SubParsersAction[argparse.ArgumentParser]) 
     _add_max_memory(parser)
 
 
-def _add_inspect(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+def _add_inspect(commands: argparse._SubParsersAction[_Parser]) -> None:
     parser = commands.add_parser(
         "inspect",
         help="say what a model is, before any work",
@@ -143,7 +188,7 @@ def _add_inspect(commands: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser.add_argument("--json", action="store_true", help="print JSON")
 
 
-def _add_verify(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+def _add_verify(commands: argparse._SubParsersAction[_Parser]) -> None:
     parser = commands.add_parser(
         "verify",
         help="check a mesh file against a model",
@@ -162,7 +207,7 @@ def _add_verify(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -
     _add_threads(parser)
 
 
-def _add_bench(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
+def _add_bench(commands: argparse._SubParsersAction[_Parser]) -> None:
     parser = commands.add_parser(
         "bench",
         help="measure exact extraction against marching cubes on this machine",

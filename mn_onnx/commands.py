@@ -5,9 +5,10 @@ from __future__ import annotations
 import argparse
 import functools
 import json
+import os
 import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -39,6 +40,7 @@ def _extract_one(options: argparse.Namespace, load_model: Callable[[], Model]) -
     from mn_onnx.profile import profile_text
     from mn_onnx.progress import ProgressEvent, TerminalProgress
 
+    _check_apart({"the model": options.model, "the mesh": options.mesh, "--report": options.report})
     if options.report is not None:
         _check_place("--report", options.report)
     with TerminalProgress(enabled=not options.quiet) as progress:
@@ -92,15 +94,22 @@ def _extract_one(options: argparse.Namespace, load_model: Callable[[], Model]) -
 
 def _extract_rows(options: argparse.Namespace) -> int:
     """`run_extract` for every row of the bound tables, of a graph that is read and lowered once."""
+    if options.row is not None:
+        raise UsageError("--all takes every row of the tables, --row one: give one of the two")
     series = Series(options.model, **_load_options(options))
+    meshes = [numbered(options.mesh, row, series.n_rows) for row in range(series.n_rows)]
+    if len(set(meshes)) < len(meshes):
+        raise UsageError(f"{options.mesh}: all rows would have the same file; give a field for the row, as {{:03d}}")
     failures = []
     for row in range(series.n_rows):
         single = argparse.Namespace(**vars(options))
-        single.mesh = numbered(options.mesh, row, series.n_rows)
+        single.mesh = meshes[row]
         single.report = None if options.report is None else numbered(options.report, row, series.n_rows)
         try:
             _extract_one(single, functools.partial(series.model, row))
         except CheckFailed as error:
+            failures += [f"row {row}: {problem}" for problem in error.problems]
+        except ModelRefused as error:
             failures += [f"row {row}: {problem}" for problem in error.problems]
     if failures:
         raise CheckFailed(failures)
@@ -186,6 +195,9 @@ def run_bench(options: argparse.Namespace) -> int:
     from mn_onnx.bench.plot import check_picture, plot
     from mn_onnx.bench.table import print_result
 
+    models = {f"model {number}": path for number, path in enumerate(options.models)}
+    for model, path in models.items():
+        _check_apart({model: path, "--json": options.json, "--plot": options.plot, "--reference": options.reference})
     if options.json is not None:
         _check_place("--json", options.json)
     if options.plot is not None:
@@ -251,6 +263,17 @@ def _check_attributes(names: Sequence[str], model: Model) -> None:
     """Raise `UsageError` if a mesh of ``model`` will not have one of the values per face."""
     if model.exact and not {"eps", "displacement"}.isdisjoint(names):
         raise UsageError("--attributes: only networks with smooth activations have eps and displacement, not this one")
+
+
+def _check_apart(paths: Mapping[str, str | None]) -> None:
+    """Raise `UsageError` if two of the ``paths``, by what they are for, are the same file."""
+    uses: dict[Path, str] = {}
+    for use, path in paths.items():
+        if path is None or path == os.devnull:
+            continue
+        other = uses.setdefault(Path(path).resolve(), use)
+        if other != use:
+            raise UsageError(f"{path} is both {other} and {use}: give two files")
 
 
 def _check_place(option: str, path: str) -> None:

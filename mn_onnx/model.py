@@ -120,7 +120,7 @@ def load(source: ModelSource | ReadModel, **options: Unpack[LoadOptions]) -> Mod
     ``options``: see `LoadOptions`.
 
     Raises `UsageError` for wrong options and unreadable paths, `ModelRefused` with every reason if the model is damaged
-    or holds what cannot be extracted.
+    or holds what cannot be extracted, `TypeError` for options that there are not.
     """
     started = time.perf_counter()
     check_options(options)
@@ -130,7 +130,9 @@ def load(source: ModelSource | ReadModel, **options: Unpack[LoadOptions]) -> Mod
 
 
 def check_options(options: LoadOptions) -> None:
-    """Raise `UsageError` for numbers that make no sense."""
+    """Raise `TypeError` for options that there are not, and `UsageError` for numbers that make no sense."""
+    if unknown := options.keys() - LoadOptions.__annotations__.keys():
+        raise TypeError(f"unknown options {sorted(unknown)}; there are {sorted(LoadOptions.__annotations__)}")
     level, knots, tolerance = options.get("level", 0.0), options.get("knots_per_period"), options.get("surrogate_tol")
     if not np.isfinite(level):
         raise UsageError(f"the level {level} is not a finite number")

@@ -16,6 +16,9 @@ from mn_onnx.progress import ProgressCallback, ProgressEvent
 from mn_onnx.reader import ModelSource
 from mn_onnx.warmup import warm_up
 
+MOST_THREADS = 1024
+"""Every thread has memory of its own."""
+
 
 class Phases(PhaseClock):
     """The clock of a run whose ``listener``, if there is one, is told of each phase and of progress within it."""
@@ -62,13 +65,18 @@ def loaded(source: Model | ModelSource, options: LoadOptions, phases: Phases) ->
     return load(source, **options)
 
 
+def check_threads(threads: int | None) -> None:
+    """Raise `UsageError` for a number of threads that makes no sense."""
+    if threads is not None and not 1 <= threads <= MOST_THREADS:
+        raise UsageError(f"threads must be at least 1 and at most {MOST_THREADS}, not {threads}")
+
+
 def prepare(model: Model, phases: Phases, *, threads: int | None, check: bool, max_memory: int | None) -> Run:
     """Compare ``model`` with onnxruntime if ``check`` is asked for, and compile or load the kernels.
 
     Raises `UsageError` for senseless ``threads`` or ``max_memory``, `CheckFailed` if the comparison fails.
     """
-    if threads is not None and threads < 1:
-        raise UsageError(f"threads must be at least 1, not {threads}")
+    check_threads(threads)
     limit = MemoryLimit.of(max_memory)
     phases.seconds.update(model.seconds)
     runtime = parity = None

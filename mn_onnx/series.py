@@ -29,7 +29,10 @@ def count_rows(bound: Mapping[str, Floats]) -> int:
         raise UsageError("rows of codes need a table: --bind NAME=codes.npy with an array of shape [rows, values]")
     if len(set(rows.values())) > 1:
         raise UsageError(f"the tables have different numbers of rows: {rows}")
-    return next(iter(rows.values()))
+    count = next(iter(rows.values()))
+    if not count:
+        raise UsageError(f"the tables have no rows: {', '.join(rows)}")
+    return count
 
 
 def row_of(bound: Mapping[str, Floats], row: int) -> dict[str, Floats]:
@@ -47,13 +50,19 @@ class Series:
     multiplied with the point (FiLM layers, hypernetworks) it is piecewise linear for each code alone, and is lowered
     for each.
 
-    Raises `UsageError` for tables that do not fit each other, and as `load` for a model that cannot be read.
+    Raises `UsageError` for tables that do not fit each other or hold numbers that are not finite, and as `load` for a
+    model that cannot be read.
     """
 
     def __init__(self, source: ModelSource | ReadModel, **options: Unpack[LoadOptions]) -> None:
         check_options(options)
         self._bound = {name: np.asarray(value, np.float64) for name, value in (options.get("bind") or {}).items()}
         self.n_rows = count_rows(self._bound)
+        for name, value in self._bound.items():
+            if not np.isfinite(value).all():
+                rows = np.unique(np.nonzero(~np.isfinite(value))[0]).tolist() if value.ndim >= 2 else []
+                where = f" in rows {', '.join(map(str, rows[:10]))}" if rows else ""
+                raise UsageError(f"{name!r} is bound to numbers that are not finite{where}")
         self._options = options
         self._read = source if isinstance(source, ReadModel) else read_model(source)
 
@@ -86,7 +95,7 @@ def numbered(path: str, row: int, n_rows: int) -> str:
     if "{" in path:
         try:
             filled = path.format(row)
-        except (ValueError, IndexError, KeyError) as error:
+        except (ValueError, LookupError, AttributeError, TypeError) as error:
             raise UsageError(f"{path}: the field for the row must be like {{:03d}} ({error})") from error
         return filled
     target = Path(path)

@@ -35,7 +35,8 @@ def mesh_summary(mesh: str, report: dict[str, Any]) -> str:
     if report["parity_runtime"] is not None:
         lines.append(
             f"  {report['parity_runtime']}: differs by {report['parity_max_abs_err']:.2g} "
-            f"({report['parity_allowed_err']:.2g} allowed), mean |f - level| {report['ort_mean_abs_f']:.2g}"
+            f"({report['parity_allowed_err']:.2g} allowed)"
+            + ("" if report["ort_mean_abs_f"] is None else f", mean |f - level| {report['ort_mean_abs_f']:.2g}")
         )
     if "seconds" in report:
         lines.append("  " + ", ".join(f"{phase} {seconds:.2f} s" for phase, seconds in report["seconds"].items()))

@@ -42,19 +42,37 @@ def findings(
             f"perturbed by {found.degeneracy.perturbation:g}; its vertices were taken back by up to "
             f"{found.degeneracy.displacement:.2g}"
         )
+    elif found.degeneracy.found:
+        notes.append(
+            f"degenerate network ({'; '.join(found.degeneracy.found)}), and no perturbation of it has a better mesh: "
+            "what lies closer together than rounding may be missing"
+        )
+        if found.statistics.broken_cuts:
+            problems.append(f"{found.statistics.broken_cuts} cells could not be cut, and what is in them is missing")
     if not invariants.polygons:
-        notes.append(empty_level_set(model))
+        notes.append(empty_level_set(model, has_flat_regions=bool(found.flat_regions)))
     return problems, notes
 
 
-def empty_level_set(model: Model) -> str:
+def empty_level_set(model: Model, *, has_flat_regions: bool = False) -> str:
     """Why there is nothing to extract, with the certified range of f and the value nearest to the level."""
+    values = model.evaluate(_grid(model))
+    nearest = values[np.abs(values - model.level).argmin()]
+    if has_flat_regions:
+        return (
+            "there is no surface: f is at the level in a part of the box and above it elsewhere, so nothing is the "
+            "border of f < level; try a level a little higher"
+        )
+    if values.min() < model.level < values.max():
+        return (
+            f"no surface was found, but the output takes values on both sides of the level {model.level:g}: its "
+            f"surrogates are too coarse (off by up to {model.surrogate_eps:.3g}); try more --knots-per-period, or "
+            "--bounds closer to the surface"
+        )
     reason = model.canonical.empty_reason
     if not reason:
         low, high = model.output_range
         reason = f"f, which is zero on it, is certified within {low:.6g} to {high:.6g} in the box"
-    values = model.evaluate(_grid(model))
-    nearest = values[np.abs(values - model.level).argmin()]
     return (
         f"the level set is empty: {reason}; of the output's values on a grid, {nearest:.6g} is nearest to the level "
         f"{model.level:g}; try another level or larger bounds"

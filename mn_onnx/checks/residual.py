@@ -73,8 +73,7 @@ def measure_residuals(
     extracted = np.abs(evaluate(model.network, points))
     true = np.abs(model.evaluate(samples) - model.level)
     if position_error is None:
-        largest = max(np.abs(model.lower).max(), np.abs(model.upper).max())
-        position_error = POSITION_ROUNDINGS * np.finfo(np.float64).eps / 2 * largest
+        position_error = position_rounding(model)
     judged = np.argsort(-extracted, kind="stable")[:JUDGED_POINTS]
     allowed = float64_error_bound(model.network, points[judged])
     slopes = np.empty(judged.size)
@@ -98,6 +97,12 @@ def measure_residuals(
         true_mean_abs_f=float(true.mean()),
         ort_mean_abs_f=ort_mean,
     )
+
+
+def position_rounding(model: Model) -> float:
+    """How far float64 rounding may have moved a coordinate of an extracted vertex."""
+    largest = max(np.abs(model.lower).max(), np.abs(model.upper).max())
+    return float(POSITION_ROUNDINGS * np.finfo(np.float64).eps / 2 * largest)
 
 
 def true_residuals(model: Model, surface: Surface, *, seed: int = 0) -> dict[str, float]:

@@ -13,9 +13,17 @@ from mn_onnx.checks.runtime import Runtime
 from mn_onnx.errors import UsageError
 from mn_onnx.extract.files import MeshFileError, read_mesh
 from mn_onnx.extract.invariants import check_invariants, mark_box_edges
+from mn_onnx.extract.surface import Surface
+from mn_onnx.extraction import DIMENSION
+from mn_onnx.ir.evaluate import gradient
 from mn_onnx.model import Model
 from mn_onnx.report import check_entries, model_entries
+from mn_onnx.run import check_threads
 
+BOX_ROUNDING = 1e-5
+"""How far a vertex may lie outside the box, relative to it: meshes are often kept in float32."""
+TURNED_SHARE = 0.01
+"""Polygons of at most this share of the area may face the wrong side: their normals may be rounding."""
 FLOAT32_ROUNDING = float(np.finfo(np.float32).eps) / 2
 
 
@@ -30,6 +38,11 @@ def verify(
     Returns the entries of `mn_onnx.report` that apply to a file, with ``problems`` (empty if the mesh is right) and
     ``notes``. Raises `UsageError` if the file cannot be read as a mesh.
     """
+    if tolerance is not None and not 0 <= tolerance < np.inf:
+        raise UsageError(f"the tolerance must be a number of at least 0, not {tolerance}")
+    check_threads(threads)
+    if model.dimension != DIMENSION:
+        raise UsageError(f"the field has {model.dimension} coordinates, but a mesh has {DIMENSION}")
     try:
         surface = read_mesh(mesh, threads=threads)
     except (MeshFileError, OSError) as error:
@@ -55,6 +68,8 @@ def verify(
             )
         elif tolerance is not None and residuals.max_abs_f > tolerance:
             problems.append(f"|f - level| is up to {residuals.max_abs_f:.3g} on the mesh, more than {tolerance:g}")
+        problems += _place_problems(model, surface)
+        notes.append("whether the mesh is the whole level set is not checked, only that it lies on it")
     return {
         "mesh": os.fspath(mesh),
         **model_entries(model),
@@ -63,3 +78,22 @@ def verify(
         "problems": problems,
         "notes": notes,
     }
+
+
+def _place_problems(model: Model, surface: Surface) -> list[str]:
+    """Vertices outside the box, and polygons that face the side where f is smaller."""
+    problems = []
+    size = float(max(np.abs(model.bounds).max(), (model.upper - model.lower).max()))
+    beyond = np.maximum(model.lower - surface.vertices, surface.vertices - model.upper).max(axis=1)
+    outside = int(np.count_nonzero(beyond > BOX_ROUNDING * size))
+    if outside:
+        problems.append(f"{outside} of {surface.n_vertices} vertices lie outside the box")
+    normals = surface.measures.area_vectors
+    centres = surface.centres(np.arange(surface.n_polygons))
+    slopes = np.einsum("ij,ij->i", gradient(model.network, centres, true_functions=True), normals)
+    share = float(np.linalg.norm(normals[slopes < 0], axis=1).sum() / np.linalg.norm(normals, axis=1).sum())
+    if share > TURNED_SHARE:
+        problems.append(
+            f"polygons of {share:.2g} of the area face the side where the field is smaller (--sign {model.sign})"
+        )
+    return problems
