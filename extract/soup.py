@@ -23,7 +23,7 @@ class PolygonSoup:
     ``box_faces``: int8 [c]; the box face (2 * axis + side, side 1 is the upper) on which the edge from this corner to
     the polygon's next corner lies, -1 for an edge inside the box.
     ``gradients``: float64 [p, 3], the gradient of ``f`` on the polygon.
-    ``errors``: float64 [p], a proved bound on ``|f_true - f|`` on the polygon's cell; zero for exact networks.
+    ``errors``: float64 [p], zeros: bounds on ``|f_true|`` are proved on the finished mesh (`mn_onnx.extract.smooth`).
     """
 
     offsets: NDArray[np.int64]

@@ -159,7 +159,7 @@ def import_options(read: ReadModel, options: LoadOptions) -> ImportOptions:
 def canonical_model(read: ReadModel, imported: Imported, options: LoadOptions, *, seconds: float) -> Model:
     """The model of ``imported``, in canonical form; ``seconds``: what importing took. Raises as `load`."""
     started = time.perf_counter()
-    level, tolerance = options.get("level", 0.0), options.get("surrogate_tol")
+    level, tolerance = float(options.get("level", 0.0)), options.get("surrogate_tol")
     bounds, bounds_from = options.get("bounds"), "option"
     if bounds is None:
         bounds, bounds_from = bounds_from_metadata(imported.metadata), "metadata"

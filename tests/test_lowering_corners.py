@@ -118,6 +118,13 @@ def test_tensors_inside_branches_may_have_the_names_of_later_ones() -> None:
     assert_agrees(model_of(nodes, {"w": float32(3, 1), "yes": np.bool_(True)}))
 
 
+def test_norms_are_defined_where_the_surrogates_of_squares_are_negative() -> None:
+    nodes = [node("ReduceL2", ["x"], ["r"], axes=[1], keepdims=1), node("Sub", ["r", "half"], ["y"])]
+    model = model_of(nodes, {"half": np.float32(0.5)}, opset=17)
+    assert_agrees(model)
+    assert 0.0 < load(model).surrogate_eps < 0.05
+
+
 @pytest.mark.parametrize(
     ("model", "reason"),
     [

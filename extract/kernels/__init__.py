@@ -1,1 +1,5 @@
-"""Compiled kernels of the traversal. They see flat arrays only; `mn_onnx.extract.schedule` is their plain wrapper."""
+"""Compiled kernels. They see flat arrays only.
+
+Those of the traversal have `mn_onnx.extract.schedule` as their plain wrapper; `patches` and `neighbours` belong to
+`mn_onnx.extract.smooth`.
+"""

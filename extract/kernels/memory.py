@@ -4,15 +4,15 @@ A worker owns two arenas, ``F`` (float64) and ``N`` (int64), which grow upwards 
 ``X`` (float64) and ``J`` (int64), cut into regions of ``M`` entries. Three kinds of blocks lie in the arenas.
 
 *System*: the network restricted to a cell and all cells inside it. ``rows`` units, padded level by level to a multiple
-of four, in large systems of eight, ``cols`` outputs of these units, and the hash of the states of all units folded
-away.
+of four, in large systems and the first one of eight, ``cols`` outputs of these units, and the hash of the states of
+all units folded away.
 
     N: the SYS_* header, level_start[levels + 1], row_unit[rows] (-1 where padded),
        row_col[rows + 1], col_row[cols], col_begin[cols], col_end[cols] (the rows a column has weights on: whole
        levels, the same for all columns of a level, and never fewer than for those of a level before)
     F: affine parts a0[rows], a1[rows], a2[rows], a3[rows] (constant); of units with one knot and one output
        knot[rows], left slope[rows], left intercept[rows], right slope[rows], right intercept[rows] (the knot is NaN for
-       other units, infinite where padded); weights[cols][rows] (anything before col_begin and
+       other units, anything else where padded); weights[cols][rows] (anything before col_begin and
        from col_end on), output weights[cols], output affine part[4]
 
 *Cell*: a simple convex polytope and its state ranges for the rows of its system.
@@ -41,10 +41,10 @@ CELL_END_F, CELL_END_I, CELL_DEPTH, CELL_HEADER = 5, 6, 7, 8
 (CENTRE, RADIUS, LOW, HIGH, SLOPE, OFFSET, ERROR, OUT_COEF) = (0, 4, 5, 6, 7, 8, 9, 10)
 (POLY_VALUES, CUT_X, CUT_Y, CUT_Z, CENTRE_AT, FORMS) = (19, 20, 21, 22, 23, 24)
 OUTPUTS = 28  # five
-CUT_SHARE, GROWTH, SETTLED_SLOPE = 33, 34, 35
-CHOSEN = 36  # four
-READ_SLOPE, READ_RADIUS, SYMBOL_ERROR, REACH = 40, 41, 42, 43
-X_REGIONS = 44
+GROWTH, SETTLED_SLOPE = 33, 34
+CHOSEN = 35  # four
+READ_SLOPE, READ_RADIUS, SYMBOL_ERROR, REACH = 39, 40, 41, 42
+X_REGIONS = 43
 # Kernels are called with these. numba compiles a kernel once more for every constant among its arguments, except for
 # numpy's: so their numbers are numpy's, as are the constants in the kernels' calls of each other.
 VALUES, OUT_VALUES, POLY_A, POLY_B = np.int64(11), np.int64(12), np.int64(13), np.int64(16)

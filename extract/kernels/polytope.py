@@ -38,7 +38,6 @@ from mn_onnx.extract.kernels.memory import (
     CUT_NEXT,
     CUT_OUT,
     CUT_PREVIOUS,
-    CUT_SHARE,
     CUT_TO,
     CUT_X,
     NEW_INDEX,
@@ -92,10 +91,10 @@ def value_range(X, M, region, count):
 def find_cut_edges(F, N, X, J, M, cell, rows, values):
     """Collect the edges on which ``X[values]`` changes sign, from the negative to the positive end.
 
-    Fills CUT_FROM and CUT_TO (``3 * vertex + slot`` at either end), the corner's position CUT_X, CUT_Y, CUT_Z, how far
-    along the edge it lies, CUT_SHARE, and the tags CUT_IN, CUT_OUT along which the polygon of the cut comes in and
-    leaves, seen from the positive side. BELOW and ABOVE list the vertices of either sign, SIDE_COUNTS their numbers,
-    and NEW_INDEX gives a vertex's place in its list. Returns the number of edges.
+    Fills CUT_FROM and CUT_TO (``3 * vertex + slot`` at either end), the corner's position CUT_X, CUT_Y, CUT_Z, and the
+    tags CUT_IN, CUT_OUT along which the polygon of the cut comes in and leaves, seen from the positive side. BELOW and
+    ABOVE list the vertices of either sign, SIDE_COUNTS their numbers, and NEW_INDEX gives a vertex's place in its list.
+    Returns the number of edges.
     """
     n = N[cell + CELL_VERTICES]
     tags = cell + CELL_HEADER + 2 * rows
@@ -135,7 +134,6 @@ def find_cut_edges(F, N, X, J, M, cell, rows, values):
         J[CUT_TO * M + j] = 3 * u + back
         J[CUT_OUT * M + j] = N[tags + 3 * v + k1]
         J[CUT_IN * M + j] = N[tags + 3 * v + k2]
-        X[CUT_SHARE * M + j] = s
         for axis in range(3):
             at = x + axis * capacity
             X[(CUT_X + axis) * M + j] = F[at + v] + s * (F[at + u] - F[at + v])

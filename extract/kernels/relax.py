@@ -23,7 +23,9 @@ from mn_onnx.extract.kernels.memory import (
     UNSTABLE,
 )
 
-# Rounding of a bound, relative to the magnitude of what was summed: 2^-40 is about 4000 units in the last place.
+# Rounding of a bound, relative to the size of the centre it is around: 2^-40 is about 4000 units in the last place.
+# Where terms cancel that are thousands of times larger than their sum, it may be more: cells may then decide a sign each
+# in its own way, which unmatched edges tell.
 MARGIN = 2.0**-40
 
 

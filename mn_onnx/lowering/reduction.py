@@ -79,7 +79,9 @@ def euclidean(context: Context, rows: Tensor) -> Tensor:
     """The root of the sum of squares; of one number, its absolute value."""
     if rows.shape[1] == 1:
         return total_absolute(context, rows)
-    return context.algebra.unary(total_square(context, rows), lambda x: apply("sqrt", x))
+    # Squares are not negative, but the surrogates of squares may be.
+    zero = constant(0.0)
+    return context.algebra.unary(total_square(context, rows), lambda x: apply("sqrt", apply("maximum", x, zero)))
 
 
 def log_total(context: Context, rows: Tensor) -> Tensor:
