@@ -24,8 +24,8 @@ from mn_onnx.extract.kernels.memory import (
 )
 
 # Rounding of a bound, relative to the size of the centre it is around: 2^-40 is about 4000 units in the last place.
-# Where terms cancel that are thousands of times larger than their sum, it may be more: cells may then decide a sign each
-# in its own way, which unmatched edges tell.
+# Where terms cancel that are thousands of times larger than their sum, it may be more: then cells may decide a sign
+# each for itself, which unmatched edges tell.
 MARGIN = 2.0**-40
 
 
