@@ -17,6 +17,7 @@ from mn_onnx.ir.bounds import output_bounds
 from mn_onnx.ir.evaluate import evaluate
 from mn_onnx.ir.network import Network
 from mn_onnx.ir.passes import Canonical, PassFailed, ToleranceNotReached
+from mn_onnx.ir.scalar import UndefinedFunction
 from mn_onnx.options import DEFAULT_BOUNDS, bounds_from_metadata, box, output_and_channel
 from mn_onnx.reader import ModelSource, ReadModel, read_model
 from mn_onnx.sign import oriented, resolve_sign
@@ -184,10 +185,24 @@ def canonical_model(read: ReadModel, imported: Imported, options: LoadOptions, *
         raise ModelRefused([Problem("", "", 0, str(error), remedy)]) from error
     except ToleranceNotReached as error:
         raise UsageError(f"--surrogate-tol {tolerance:g} cannot be certified: {error}") from error
-    sign = resolve_sign(canonical, options.get("sign"))
+    with np.errstate(over="ignore", invalid="ignore"):
+        sign = resolve_sign(canonical, options.get("sign"))
     phases = {"import": seconds, "lower": time.perf_counter() - started}
     model = Model(read, imported, oriented(canonical, sign), level, lower, upper, phases, sign, bounds_from, fineness)
-    if not canonical.empty_reason and model.output_range == (0.0, 0.0):
-        reason = f"the output is {level:g}, the level, everywhere in the box: there is no surface"
-        raise ModelRefused([Problem("", "", 0, reason, "check the weights, or choose another --level or --output")])
+    if not canonical.empty_reason:
+        _refuse_constants_and_overflow(model)
     return model
+
+
+def _refuse_constants_and_overflow(model: Model) -> None:
+    try:
+        with np.errstate(over="ignore", invalid="ignore"):
+            low, high = model.output_range
+    except UndefinedFunction:
+        low = high = np.nan
+    if low == high == 0.0:
+        reason = f"the output is {model.level:g}, the level, everywhere in the box: there is no surface"
+        raise ModelRefused([Problem("", "", 0, reason, "check the weights, or choose another --level or --output")])
+    if not np.isfinite([low, high]).all():
+        reason = "its values in the box may be too large for float64"
+        raise ModelRefused([Problem("", "", 0, reason, "scale the weights down, or choose smaller --bounds")])

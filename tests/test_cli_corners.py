@@ -121,8 +121,23 @@ def test_level_sets_without_a_border_are_not_called_empty(tmp_path: Path, capsys
     path = written(tmp_path / "flat.onnx", model_of(nodes, {"half": np.float32(0.5)}))
     assert main(["extract", str(path), "-o", str(tmp_path / "mesh.ply"), "--quiet"]) == EXIT_CHECK
     message = capsys.readouterr().err
-    assert "nothing is the border of f < level" in message
+    assert "reaches the level 0 but does not pass through it" in message
     assert "empty" not in message
+
+
+def test_values_too_large_for_float64_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    weights = {name: np.full((3, 3), 1e150) for name in "uvw"} | {"z": np.ones((3, 1))}
+    nodes = [
+        *(
+            node("MatMul", [a, w], [b])
+            for a, w, b in [("x", "u", "a"), ("r", "v", "b"), ("s", "w", "c"), ("c", "z", "y")]
+        ),
+        *(node("Relu", [a], [b]) for a, b in [("a", "r"), ("b", "s")]),
+    ]
+    types = {"x": onnx.TensorProto.DOUBLE, "y": onnx.TensorProto.DOUBLE}
+    path = written(tmp_path / "large.onnx", model_of(nodes, weights, types=types))
+    assert main(["inspect", str(path)]) == EXIT_USAGE
+    assert "too large for float64" in capsys.readouterr().err
 
 
 def test_smooth_networks_over_one_coordinate_have_roots(tmp_path: Path) -> None:

@@ -58,16 +58,16 @@ def empty_level_set(model: Model, *, has_flat_regions: bool = False) -> str:
     """Why there is nothing to extract, with the certified range of f and the value nearest to the level."""
     values = model.evaluate(_grid(model))
     nearest = values[np.abs(values - model.level).argmin()]
-    if has_flat_regions:
-        return (
-            "there is no surface: f is at the level in a part of the box and above it elsewhere, so nothing is the "
-            "border of f < level; try a level a little higher"
-        )
-    if values.min() < model.level < values.max():
+    if values.min() < model.level < values.max() and not has_flat_regions:
         return (
             f"no surface was found, but the output takes values on both sides of the level {model.level:g}: its "
             f"surrogates are too coarse (off by up to {model.surrogate_eps:.3g}); try more --knots-per-period, or "
             "--bounds closer to the surface"
+        )
+    if has_flat_regions or nearest == model.level:
+        return (
+            f"there is no surface: the output reaches the level {model.level:g} but does not pass through it; try a "
+            "level a little higher or lower"
         )
     reason = model.canonical.empty_reason
     if not reason:
