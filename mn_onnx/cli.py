@@ -43,9 +43,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
             status: int = options.run(options)
         sys.stdout.flush()
         return status
-    except BrokenPipeError:
-        # Whoever read the output has seen enough. Python would complain once more when it closes the pipe.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    except BrokenPipeError:  # whoever read the output has seen enough
+        _drop_output()
         return EXIT_PIPE
     except CheckFailed as error:
         _complain(str(error))
@@ -63,9 +62,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         _complain("interrupted")
         return EXIT_INTERRUPTED
-    except OSError as error:
-        _complain(f"cannot print: {error.strerror or error}")
+    except OSError as error:  # of printing, as files have messages of their own
+        _complain(str(error))
+        _drop_output()
         return EXIT_USAGE
+
+
+def _drop_output() -> None:
+    """Python would complain once more when it closes the standard output, with what could not be written."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 @contextmanager
