@@ -97,19 +97,14 @@ def _extract_rows(options: argparse.Namespace) -> int:
     if options.row is not None:
         raise UsageError("--all takes every row of the tables, --row one: give one of the two")
     series = Series(options.model, **_load_options(options))
-    meshes = [numbered(options.mesh, row, series.n_rows) for row in range(series.n_rows)]
-    if len(set(meshes)) < len(meshes):
-        raise UsageError(f"{options.mesh}: all rows would have the same file; give a field for the row, as {{:03d}}")
+    meshes = numbered(options.mesh, series.n_rows)
+    reports = [None] * series.n_rows if options.report is None else numbered(options.report, series.n_rows)
     failures = []
-    for row in range(series.n_rows):
-        single = argparse.Namespace(**vars(options))
-        single.mesh = meshes[row]
-        single.report = None if options.report is None else numbered(options.report, row, series.n_rows)
+    for row, (mesh, report) in enumerate(zip(meshes, reports, strict=True)):
+        single = argparse.Namespace(**{**vars(options), "mesh": mesh, "report": report})
         try:
             _extract_one(single, functools.partial(series.model, row))
-        except CheckFailed as error:
-            failures += [f"row {row}: {problem}" for problem in error.problems]
-        except ModelRefused as error:
+        except (CheckFailed, ModelRefused) as error:
             failures += [f"row {row}: {problem}" for problem in error.problems]
     if failures:
         raise CheckFailed(failures)

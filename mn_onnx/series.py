@@ -87,16 +87,18 @@ class Series:
         return canonical_model(self._read, imported, options, seconds=time.perf_counter() - started)
 
 
-def numbered(path: str, row: int, n_rows: int) -> str:
-    """The file of a row: ``path`` with its field filled in, as in ``mesh_{:03d}.ply``, or with ``-ROW`` before its end.
+def numbered(path: str, n_rows: int) -> list[str]:
+    """The file of every row: ``path`` with its field filled in, as in ``mesh_{:03d}.ply``, or ``-ROW`` before its end.
 
-    Raises `UsageError` for a field that no number fits.
+    Raises `UsageError` for a field that no number fits, and one that gives all rows the same file.
     """
-    if "{" in path:
-        try:
-            filled = path.format(row)
-        except (ValueError, LookupError, AttributeError, TypeError) as error:
-            raise UsageError(f"{path}: the field for the row must be like {{:03d}} ({error})") from error
-        return filled
-    target = Path(path)
-    return str(target.with_name(f"{target.stem}-{row:0{len(str(n_rows - 1))}d}{target.suffix}"))
+    if "{" not in path:
+        target, digits = Path(path), len(str(n_rows - 1))
+        return [str(target.with_name(f"{target.stem}-{row:0{digits}d}{target.suffix}")) for row in range(n_rows)]
+    try:
+        filled = [path.format(row) for row in range(n_rows)]
+    except (ValueError, LookupError, AttributeError, TypeError) as error:
+        raise UsageError(f"{path}: the field for the row must be like {{:03d}} ({error})") from error
+    if len(set(filled)) < n_rows:
+        raise UsageError(f"{path}: all rows would have the same file; give a field for the row, like {{:03d}}")
+    return filled

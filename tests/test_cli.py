@@ -222,7 +222,8 @@ def test_verify_tells_a_right_mesh_from_a_wrong_one(
     assert "have no neighbour" in capsys.readouterr().err
 
 
-def test_an_interrupt_stops_at_once_and_leaves_nothing(tmp_path: Path) -> None:
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_an_interrupt_stops_at_once_and_leaves_nothing(number: signal.Signals, tmp_path: Path) -> None:
     command = [*COMMAND, "extract", str(ROOT / "models" / "bunny_relu_d4_w128.onnx"), "-o", str(tmp_path / "mesh.ply")]
     terminal, end = pty.openpty()
     process = subprocess.Popen(
@@ -230,14 +231,14 @@ def test_an_interrupt_stops_at_once_and_leaves_nothing(tmp_path: Path) -> None:
         stdout=subprocess.DEVNULL,
         stderr=end,
         env={**os.environ, "TERM": "xterm"},
-        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # whatever started the tests may ignore it
+        preexec_fn=lambda: signal.signal(number, signal.SIG_DFL),  # whatever started the tests may ignore it
     )
     os.close(end)
     drawn = b""
     while b"traverse" not in drawn:
         drawn += os.read(terminal, 4096)
     interrupted = time.monotonic()
-    process.send_signal(signal.SIGINT)
+    process.send_signal(number)
     errors = rest_of(terminal)
     assert process.wait() == EXIT_INTERRUPTED
     assert time.monotonic() - interrupted < 2

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import json
 import os
-import signal
 import subprocess
 import sys
-import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -23,7 +21,6 @@ from mn_onnx.errors import CheckFailed
 from mn_onnx.extract import pipeline
 
 COMMAND = [sys.executable, "-m", "mn_onnx"]
-MODELS = Path(__file__).parents[1] / "models"
 
 
 def written(path: Path, model: onnx.ModelProto) -> Path:
@@ -87,18 +84,6 @@ def test_output_that_nobody_reads_is_no_error(model: Path) -> None:
     os.close(writer)
     assert done.stderr == b""
     assert done.returncode == EXIT_PIPE
-
-
-def test_a_request_to_end_leaves_nothing(tmp_path: Path) -> None:
-    mesh = tmp_path / "mesh.ply"
-    command = [*COMMAND, "extract", str(MODELS / "bunny_relu_d4_w128.onnx"), "-o", str(mesh), "--threads", "1"]
-    with subprocess.Popen(command, stderr=subprocess.PIPE) as process:
-        time.sleep(2.0)
-        process.send_signal(signal.SIGTERM)
-        assert process.stderr is not None
-        assert b"interrupted" in process.stderr.read()
-        assert process.wait() == 130
-    assert list(tmp_path.iterdir()) == []
 
 
 def test_far_surrogates_are_not_called_an_empty_level_set(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -13,6 +13,7 @@ from onnx_models import assert_agrees, float32, int64, model_of, node
 
 from mn_onnx.errors import ModelRefused, UsageError
 from mn_onnx.model import load
+from mn_onnx.reader import read_model
 
 ONES = np.ones((6, 1), np.float32)
 
@@ -92,7 +93,8 @@ def test_constants_are_folded_as_onnxruntime_has_them() -> None:
 
 @pytest.mark.parametrize(("op", "last"), [("Ceil", ()), ("Floor", ()), ("Cast", (("to", TensorProto.INT64),))])
 def test_constants_are_rounded_before_they_jump(op: str, last: tuple[tuple[str, int], ...]) -> None:
-    a, b = (np.float32(30), np.float32(0.1)) if op != "Cast" else (np.float32(100), np.float32(0.29))
+    # Whole numbers in float32, but just above or below them in float64.
+    a, b = (np.float32(number) for number in {"Ceil": (30, 0.1), "Floor": (10, 0.7), "Cast": (100, 0.29)}[op])
     model = model_of(
         [
             node("Mul", ["a", "b"], ["c"]),
@@ -115,7 +117,8 @@ def test_tensors_inside_branches_may_have_the_names_of_later_ones() -> None:
         node("Abs", ["out"], ["q"]),
         node("Add", ["q", "h"], ["y"]),
     ]
-    assert_agrees(model_of(nodes, {"w": float32(3, 1), "yes": np.bool_(True)}))
+    model = model_of(nodes, {"w": float32(3, 1), "yes": np.bool_(True)})
+    assert_agrees(read_model(model).model)
 
 
 def test_norms_are_defined_where_the_surrogates_of_squares_are_negative() -> None:

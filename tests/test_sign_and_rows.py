@@ -120,7 +120,7 @@ def test_rows_of_tables() -> None:
 
 
 def test_names_of_numbered_files() -> None:
-    assert numbered("mesh_{:03d}.ply", 7, 10) == "mesh_007.ply"
-    assert numbered("out/mesh.ply", 7, 12) == "out/mesh-07.ply"
+    assert numbered("mesh_{:03d}.ply", 10)[7] == "mesh_007.ply"
+    assert numbered("out/mesh.ply", 12)[7] == "out/mesh-07.ply"
     with pytest.raises(UsageError, match="03d"):
-        numbered("mesh_{name}.ply", 7, 10)
+        numbered("mesh_{name}.ply", 10)

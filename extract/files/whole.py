@@ -17,11 +17,11 @@ def written_whole(target: Path) -> Iterator[BinaryIO]:
 
     Raises OSError if writing fails.
     """
-    target = target.resolve()
     if target.exists() and not target.is_file():
         with target.open("wb") as stream:
             yield stream
         return
+    target = target.resolve()
     partial = target.with_name(f".{target.name}.{os.getpid()}.partial")
     try:
         with partial.open("wb") as stream:

@@ -59,10 +59,12 @@ def empty_level_set(model: Model, *, has_flat_regions: bool = False) -> str:
     values = model.evaluate(_grid(model))
     nearest = values[np.abs(values - model.level).argmin()]
     if values.min() < model.level < values.max() and not has_flat_regions:
+        found = f"no surface was found, but the output takes values on both sides of the level {model.level:g}"
+        if model.exact:
+            return f"{found}: either they differ from it by rounding only, or this is a fault of mn-onnx"
         return (
-            f"no surface was found, but the output takes values on both sides of the level {model.level:g}: its "
-            f"surrogates are too coarse (off by up to {model.surrogate_eps:.3g}); try more --knots-per-period, or "
-            "--bounds closer to the surface"
+            f"{found}: its surrogates are too coarse (off by up to {model.surrogate_eps:.3g}); try more "
+            "--knots-per-period, or --bounds closer to the surface"
         )
     if has_flat_regions or nearest == model.level:
         return (

@@ -88,10 +88,10 @@ def _place_problems(model: Model, surface: Surface) -> list[str]:
     outside = int(np.count_nonzero(beyond > BOX_ROUNDING * size))
     if outside:
         problems.append(f"{outside} of {surface.n_vertices} vertices lie outside the box")
-    normals = surface.measures.area_vectors
-    centres = surface.centres(np.arange(surface.n_polygons))
-    slopes = np.einsum("ij,ij->i", gradient(model.network, centres, true_functions=True), normals)
-    share = float(np.linalg.norm(normals[slopes < 0], axis=1).sum() / np.linalg.norm(normals, axis=1).sum())
+    gradients = gradient(model.network, surface.centres(np.arange(surface.n_polygons)), true_functions=True)
+    turned = np.einsum("ij,ij->i", gradients, surface.measures.area_vectors) < 0
+    areas = surface.measures.areas
+    share = float(areas[turned].sum() / areas.sum())
     if share > TURNED_SHARE:
         problems.append(
             f"polygons of {share:.2g} of the area face the side where the field is smaller (--sign {model.sign})"

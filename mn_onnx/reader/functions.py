@@ -7,6 +7,8 @@ from collections.abc import Iterable, Mapping
 import onnx
 import onnx.inliner
 
+from mn_onnx.reader.structure import inner_graphs
+
 Key = tuple[str, str, str]
 """The domain, name and overload of a function."""
 
@@ -32,6 +34,5 @@ def _write_defaults(nodes: Iterable[onnx.NodeProto], defaults: Mapping[Key, Iter
         given = {attribute.name for attribute in node.attribute}
         missing = defaults.get((node.domain, node.op_type, node.overload), ())
         node.attribute.extend(attribute for attribute in missing if attribute.name not in given)
-        for attribute in node.attribute:
-            for inner in [attribute.g, *attribute.graphs] if attribute.HasField("g") else attribute.graphs:
-                _write_defaults(inner.node, defaults)
+        for inner in inner_graphs(node):
+            _write_defaults(inner.node, defaults)

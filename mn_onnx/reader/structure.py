@@ -72,7 +72,7 @@ def sort_nodes(graph: onnx.GraphProto, opsets: Mapping[str, int], outer: frozens
     given = {value.name for value in graph.input} | {tensor.name for tensor in graph.initializer} | outer
     visible = frozenset(given | producer.keys())
     for node in graph.node:
-        for inner in _inner_graphs(node):
+        for inner in inner_graphs(node):
             problems += sort_nodes(inner, opsets, visible)
     for node in graph.node:
         for name in sorted(set(_own_reads(node)) - visible):
@@ -111,7 +111,7 @@ def node_problems(graph: onnx.GraphProto, model: onnx.ModelProto) -> list[Proble
     context.opset_imports = dict(opsets)
     problems = []
     for node in graph.node:
-        inner = list(_inner_graphs(node))
+        inner = list(inner_graphs(node))
         for part in inner:
             problems += node_problems(part, model)
         domain = "" if node.domain == "ai.onnx" else node.domain
@@ -160,7 +160,8 @@ def _repeated_names(graph: onnx.GraphProto, opsets: Mapping[str, int]) -> Iterat
             written.add(name)
 
 
-def _inner_graphs(node: onnx.NodeProto) -> Iterator[onnx.GraphProto]:
+def inner_graphs(node: onnx.NodeProto) -> Iterator[onnx.GraphProto]:
+    """The graphs in the attributes of a node."""
     for attribute in node.attribute:
         if attribute.HasField("g"):
             yield attribute.g
@@ -174,7 +175,7 @@ def _own_reads(node: onnx.NodeProto) -> Iterable[str]:
 def _reads(node: onnx.NodeProto) -> Iterator[str]:
     """The tensors a node reads, those that the graphs inside it take from around them included."""
     yield from _own_reads(node)
-    for inner in _inner_graphs(node):
+    for inner in inner_graphs(node):
         own = {value.name for value in inner.input} | {tensor.name for tensor in inner.initializer}
         own.update(name for part in inner.node for name in part.output)
         read = {name for part in inner.node for name in _reads(part)} | {value.name for value in inner.output}

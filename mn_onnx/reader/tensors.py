@@ -13,6 +13,7 @@ from onnx import external_data_helper, numpy_helper
 
 from mn_onnx.errors import Problem
 from mn_onnx.reader.formats import PROTOBUF_LIMIT
+from mn_onnx.reader.structure import inner_graphs
 
 _STORE_ANEW = (
     "export the model again, or store its weights inside the file (onnx.save with save_as_external_data=False)"
@@ -155,9 +156,8 @@ def densify(graph: onnx.GraphProto) -> list[Problem]:
     """Make the sparse tensors of ``graph`` dense, and those of the graphs inside it; returns the problems found."""
     problems = _densify_initializers(graph) + _densify_constants(graph)
     for node in graph.node:
-        for attribute in node.attribute:
-            for inner in [attribute.g, *attribute.graphs] if attribute.HasField("g") else attribute.graphs:
-                problems += densify(inner)
+        for inner in inner_graphs(node):
+            problems += densify(inner)
     return problems
 
 
