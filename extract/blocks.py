@@ -15,10 +15,11 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor, wait
 from typing import Any
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
+
+from mn_onnx.ir.kernel import threaded_kernel
 
 BLOCK_SIZE = 1 << 16
 """Items per block: some hundred microseconds of work, so that handing it out costs nothing beside it."""
@@ -143,7 +144,7 @@ def index_dtype(n_items: int) -> type[Any]:
     return np.int32 if n_items <= np.iinfo(np.int32).max else np.int64
 
 
-@numba.njit(cache=True, nogil=True)
+@threaded_kernel
 def _count_groups(
     groups: NDArray[np.uint16], block_size: int, first: int, last: int, counts: NDArray[np.int64]
 ) -> None:
@@ -152,7 +153,7 @@ def _count_groups(
             counts[block, groups[item]] += 1
 
 
-@numba.njit(cache=True, nogil=True)
+@threaded_kernel
 def _place_items(
     groups: NDArray[np.uint16], block_size: int, first: int, last: int, cursors: NDArray[np.int64], order: Indices
 ) -> None:

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from mn_onnx.extract.blocks import Indices
 from mn_onnx.extract.edges import half_edge_heads
 from mn_onnx.extract.measures import PolygonMeasures
+from mn_onnx.ir.kernel import threaded_kernel
 
 
 @dataclass(frozen=True)
@@ -36,7 +36,7 @@ class Component:
         return self.vertices - self.edges + self.polygons
 
 
-@numba.njit(cache=True, nogil=True)
+@threaded_kernel
 def _find_root(parents: Indices, vertex: int) -> int:
     while parents[vertex] != vertex:
         parents[vertex] = parents[parents[vertex]]
@@ -44,7 +44,7 @@ def _find_root(parents: Indices, vertex: int) -> int:
     return vertex
 
 
-@numba.njit(cache=True, nogil=True)
+@threaded_kernel
 def _connect(tails: Indices, heads: Indices, parents: Indices) -> None:
     """Make the smallest connected vertex the parent of every vertex."""
     for edge in range(tails.size):

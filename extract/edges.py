@@ -5,11 +5,11 @@ The half-edge of corner ``c`` runs from the vertex of ``c`` to the vertex of the
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from mn_onnx.extract.blocks import BLOCK_SIZE, FINE_BLOCK, Indices, block_count, group_items, index_dtype, run_blocks
+from mn_onnx.ir.kernel import threaded_kernel
 
 _MAX_PARTITIONS = 1 << 16  # their numbers fit in uint16
 _CORNERS_PER_PARTITION = 1 << 13  # whose counters fit in the cache of a core
@@ -34,7 +34,7 @@ def preceding_corners(offsets: NDArray[np.int64]) -> Indices:
     return preceding
 
 
-@numba.njit(cache=True, nogil=True)
+@threaded_kernel
 def _sort_partitions(
     corners: Indices,
     order: Indices,
@@ -96,7 +96,7 @@ def corners_by_vertex(corners: Indices, n_vertices: int, threads: int) -> tuple[
     return order, starts
 
 
-@numba.njit(cache=True, nogil=True)
+@threaded_kernel
 def _partition_half_edges(
     offsets: NDArray[np.int64],
     corners: Indices,
@@ -129,13 +129,13 @@ def _partition_half_edges(
         folded[block] = meets_twice
 
 
-@numba.njit(cache=True, nogil=True)
+@threaded_kernel
 def _in_one_polygon(offsets: NDArray[np.int64], corner: int, other: int) -> bool:
     polygon = np.searchsorted(offsets, corner, side="right")
     return bool(offsets[polygon - 1] <= other < offsets[polygon])
 
 
-@numba.njit(cache=True, nogil=True)
+@threaded_kernel
 def _pair_partitions(
     offsets: NDArray[np.int64],
     corners: Indices,

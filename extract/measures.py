@@ -4,16 +4,16 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from mn_onnx.extract.blocks import FINE_BLOCK, Indices, block_count, run_blocks
+from mn_onnx.ir.kernel import threaded_kernel
 
 Floats = NDArray[np.float64]
 
 
-@numba.njit(cache=True, nogil=True)
+@threaded_kernel
 def lengths(vectors: Floats) -> Floats:
     """Lengths [n] of vectors [n, 3]."""
     result = np.empty(vectors.shape[0])
@@ -40,7 +40,7 @@ class PolygonMeasures:
     shortest_edges: Floats
 
 
-@numba.njit(cache=True, nogil=True)
+@threaded_kernel
 def _measure(
     vertices: Floats,
     offsets: NDArray[np.int64],

@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from mn_onnx.extract.blocks import Indices
 from mn_onnx.extract.surface import Surface
+from mn_onnx.ir.kernel import threaded_kernel
 
 Floats = NDArray[np.float64]
 
 
-@numba.njit(cache=True, nogil=True)
+@threaded_kernel
 def _place(
     vertices: Floats,
     offsets: NDArray[np.int64],

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from mn_onnx.extract.blocks import FINE_BLOCK, Indices, block_count, run_blocks
+from mn_onnx.ir.kernel import threaded_kernel
 
 Floats = NDArray[np.float64]
 
 
-@numba.njit(cache=True, nogil=True)
+@threaded_kernel
 def _fan(
     vertices: Floats,
     offsets: NDArray[np.int64],

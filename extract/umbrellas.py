@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from mn_onnx.extract.blocks import BLOCK_SIZE, Indices, block_count, run_blocks
 from mn_onnx.extract.edges import preceding_corners
+from mn_onnx.ir.kernel import threaded_kernel
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,7 +32,7 @@ class Umbrellas:
         return self.polygons + self.gaps
 
 
-@numba.njit(cache=True, nogil=True)
+@threaded_kernel
 def _visit_corners(
     corners: Indices, twins: Indices, starts: Indices, polygons: NDArray[np.int32], gaps: NDArray[np.int32]
 ) -> None:
@@ -47,7 +47,7 @@ def _visit_corners(
             starts[vertex] = corner
 
 
-@numba.njit(cache=True, nogil=True)
+@threaded_kernel
 def _walk_umbrellas(
     preceding: Indices,
     twins: Indices,

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from typing import Any
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
@@ -24,6 +23,7 @@ from mn_onnx.extract.blocks import (
 from mn_onnx.extract.edges import pair_half_edges
 from mn_onnx.extract.soup import PolygonSoup
 from mn_onnx.extract.surface import Surface
+from mn_onnx.ir.kernel import threaded_kernel
 
 POSITION_AGREEMENT = 1e-9
 """Points of one vertex may differ by this much, relative to the largest coordinate, before they are reported."""
@@ -37,13 +37,13 @@ _KEY_MIX = 0xC2B2AE3D27D4EB4F
 _GOLDEN = 0x9E3779B97F4A7C15
 
 
-@numba.njit(cache=True, nogil=True)
+@threaded_kernel
 def _mix(low: np.uint64, high: np.uint64) -> np.uint64:
     """A hash of both halves of a key; its upper bits are the key's partition, lower ones its place in a table."""
     return (low ^ (high * np.uint64(_KEY_MIX))) * np.uint64(_GOLDEN)
 
 
-@numba.njit(cache=True, nogil=True)
+@threaded_kernel
 def _assign_partitions(
     keys: NDArray[np.uint64], bits: int, block_size: int, first: int, last: int, partitions: NDArray[np.uint16]
 ) -> None:
@@ -52,7 +52,7 @@ def _assign_partitions(
         partitions[point] = _mix(keys[point, 0], keys[point, 1]) >> np.uint64(64 - bits)
 
 
-@numba.njit(cache=True, nogil=True)
+@threaded_kernel
 def _find_first_points(
     keys: NDArray[np.uint64], order: Indices, starts: NDArray[np.int64], first: int, last: int, first_points: Indices
 ) -> None:
@@ -80,7 +80,7 @@ def _find_first_points(
             first_points[order[begin + item]] = order[begin + held]
 
 
-@numba.njit(cache=True, nogil=True)
+@threaded_kernel
 def _count_vertices(first_points: Indices, block_size: int, first: int, last: int, counts: NDArray[np.int64]) -> None:
     """The number of first points in each of the blocks ``first .. last``, one place further on in ``counts``."""
     for block in range(first, last):
@@ -90,7 +90,7 @@ def _count_vertices(first_points: Indices, block_size: int, first: int, last: in
         counts[block + 1] = count
 
 
-@numba.njit(cache=True, nogil=True)
+@threaded_kernel
 def _number_vertices(
     first_points: Indices,
     positions: Floats,
@@ -112,7 +112,7 @@ def _number_vertices(
                 vertex += 1
 
 
-@numba.njit(cache=True, nogil=True)
+@threaded_kernel
 def _number_other_points(
     first_points: Indices,
     positions: Floats,
@@ -142,7 +142,7 @@ def _number_other_points(
                 apart[numbers[point]] = True
 
 
-@numba.njit(cache=True, nogil=True)
+@threaded_kernel
 def _number_corners(
     points: Indices, numbers: Indices, block_size: int, first: int, last: int, corners: Indices
 ) -> None:

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import NamedTuple
 
-import numba
 import numpy as np
 
+from mn_onnx.ir.kernel import threaded_kernel
 from mn_onnx.ir.network import Floats, Integers
 from mn_onnx.ir.surrogate.local_deviation import DeviationProfile
 
@@ -50,7 +50,7 @@ def flat_profiles(profiles: Sequence[DeviationProfile]) -> FlatProfiles:
     return FlatProfiles(np.concatenate([np.zeros(1, np.int64), np.cumsum(sizes)]), *parts)
 
 
-@numba.njit(cache=True)
+@threaded_kernel
 def _cell(starts: Floats, low: int, end: int, t: float) -> int:
     """The cell of ``t`` among ``low`` .. ``end - 1``."""
     high = end - 1
@@ -63,7 +63,7 @@ def _cell(starts: Floats, low: int, end: int, t: float) -> int:
     return low
 
 
-@numba.njit(cache=True)
+@threaded_kernel
 def _relax(
     profiles: FlatProfiles,
     owner: Integers,

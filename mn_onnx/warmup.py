@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from contextlib import nullcontext
+import gc
+from collections.abc import Iterator
+from contextlib import contextmanager, nullcontext
 
 import numpy as np
 
@@ -18,6 +20,8 @@ from mn_onnx.ir.network import AffineRow, KnotTable, Network, Unit
 from mn_onnx.second_compiler import compiling_beside
 
 DIMENSION = 3
+# Objects made between two collections of the first generation, and collections of one between two of the next.
+FEW_COLLECTIONS = (50_000, 50, 50)
 
 
 def warm_up(threads: int | None = None) -> Surface:
@@ -27,9 +31,22 @@ def warm_up(threads: int | None = None) -> Surface:
     cores) or more, a second process compiles the kernels for meshes and some of the traversal's, if need be, while this
     one compiles the others.
     """
-    with compiling_beside(__name__) if resolve_threads(threads) > 1 else nullcontext():
-        soup, _ = traverse(_octahedral_network(), -np.ones(DIMENSION), np.ones(DIMENSION), threads=1)
-    return _meshed(soup)
+    with _few_collections():
+        with compiling_beside(__name__) if resolve_threads(threads) > 1 else nullcontext():
+            soup, _ = traverse(_octahedral_network(), -np.ones(DIMENSION), np.ones(DIMENSION), threads=1)
+        return _meshed(soup)
+
+
+@contextmanager
+def _few_collections() -> Iterator[None]:
+    """Look for garbage rarely: among the many objects that numba makes and keeps it takes 7 % of a compilation."""
+    thresholds = gc.get_threshold()
+    if thresholds[0] > 0:  # 0: never
+        gc.set_threshold(*FEW_COLLECTIONS)
+    try:
+        yield
+    finally:
+        gc.set_threshold(*thresholds)
 
 
 def _octahedral_network() -> Network:
@@ -74,5 +91,6 @@ def _meshed(soup: PolygonSoup) -> Surface:
 if __name__ == "__main__":
     # The second process: first the kernels that the traversal needs last, then those for meshes. What both compile must
     # be for the same types: written to the cache at the same time for different ones, numba gives both files one name.
-    compile_ahead()
-    _meshed(_octahedral_soup())
+    with _few_collections():
+        compile_ahead()
+        _meshed(_octahedral_soup())

@@ -6,11 +6,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, BinaryIO
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from mn_onnx.extract.files.polygon_mesh import MeshFileError, PolygonMesh, chunks
+from mn_onnx.ir.kernel import threaded_kernel
 
 _TYPES = {
     "char": "i1",
@@ -149,7 +149,7 @@ def _type(path: Path, name: str) -> str:
     return _TYPES[name]
 
 
-@numba.njit(cache=True)
+@threaded_kernel
 def _scan_list_counts(
     data: NDArray[np.uint8],
     begin: int,

@@ -8,7 +8,6 @@ The output is bounded by a backward pass over the same chords, as in CROWN (Zhan
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
 from mn_onnx.extract.kernels.centres import read_outputs, read_tracked_outputs, row_extremes
 from mn_onnx.extract.kernels.error_symbols import ROWS_BEYOND, clear_row, number_errors, track_errors, track_output
@@ -55,13 +54,14 @@ from mn_onnx.extract.kernels.memory import (
 from mn_onnx.extract.kernels.polytope import evaluate_affine, value_range
 from mn_onnx.extract.kernels.relax import MARGIN
 from mn_onnx.extract.kernels.settle import AGAIN, FIRST, list_live_rows, settle_rows
+from mn_onnx.ir.kernel import kernel
 
 # Large cells are bounded no further than a level of whose units less than one in so many settles: of later levels
 # still fewer do, and the output could be anything.
 LEAST_SETTLED = 4
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def count_units(N, row_unit, begin, end):
     """How many of the rows are units, and not padding."""
     count = 0
@@ -70,7 +70,7 @@ def count_units(N, row_unit, begin, end):
     return count
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def leave_unbounded(N, X, J, M, row_col, rows, begin):
     """Rows from ``begin`` on keep their states, and may be anything."""
     for r in range(begin, rows):
@@ -80,7 +80,7 @@ def leave_unbounded(N, X, J, M, row_col, rows, begin):
         J[COL_KIND * M + c] = UNSTABLE
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def bound_units(F, N, X, J, M, tables, cell, system, floats, scratch, tracked, large):
     """Forward pass: bounds, states and relaxations of all rows of the system over the cell.
 
@@ -146,7 +146,7 @@ def bound_units(F, N, X, J, M, tables, cell, system, floats, scratch, tracked, l
     return linear, dead, True, radius
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def bound_first_level(F, N, X, J, M, tables, cell, system, floats):
     """`bound_units` for the first level only, where every row is affine; later rows keep their states."""
     rows, levels = N[system + SYS_ROWS], N[system + SYS_LEVELS]
@@ -162,7 +162,7 @@ def bound_first_level(F, N, X, J, M, tables, cell, system, floats):
     leave_unbounded(N, X, J, M, row_unit + rows, rows, end)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def settle_again(F, N, X, J, M, tables, cell, system, floats):
     """After a cell has been trimmed: settle its unstable rows by the centres and radii they had on the whole cell.
 
@@ -177,7 +177,7 @@ def settle_again(F, N, X, J, M, tables, cell, system, floats):
     return linear, dead
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def multiply_columns(F, X, multiplier, column, second, third, fourth, begin, end):
     """Products of rows ``begin : end`` of X[multiplier] with four columns, F[column] and those so far behind it."""
     a, b, c, d = splat_wide(0.0), splat_wide(0.0), splat_wide(0.0), splat_wide(0.0)
@@ -201,7 +201,7 @@ def multiply_columns(F, X, multiplier, column, second, third, fourth, begin, end
     return totals(a4, b4, c4, d4)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def bound_output_form(F, N, X, M, system, floats):
     """Backward pass: the output's linear centre (X[CENTRE_AT], four numbers) and its radius, which is returned."""
     rows, cols = N[system + SYS_ROWS], N[system + SYS_COLS]
@@ -262,7 +262,7 @@ def bound_output_form(F, N, X, M, system, floats):
     return radius
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def bound_output(F, N, X, M, extent, cell, system, floats, radius):
     """The output over the cell, after `bound_units`: the range of its linear centre, and how far it may be from that.
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from numba import njit
-
 from mn_onnx.extract.kernels.lanes import (
     fma,
     larger,
@@ -30,9 +28,10 @@ from mn_onnx.extract.kernels.memory import (
     READ_RADIUS,
     weights_of,
 )
+from mn_onnx.ir.kernel import inlined_kernel, kernel
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def row_extremes(F, N, X, M, cell, begin, end):
     """LOW and HIGH of rows ``begin:end`` (multiples of the lane width) over the cell's vertices."""
     r = begin
@@ -43,7 +42,7 @@ def row_extremes(F, N, X, M, cell, begin, end):
         row_extremes_lanes(splat(0.0), F, N, X, M, cell, r)
 
 
-@njit(cache=True, error_model="numpy", inline="always")
+@inlined_kernel
 def row_extremes_lanes(like, F, N, X, M, cell, r):
     """`row_extremes` for as many rows from ``r`` on as ``like`` has lanes."""
     n, x, capacity = N[cell + CELL_VERTICES], N[cell + CELL_FLOATS], N[cell + CELL_CAPACITY]
@@ -61,7 +60,7 @@ def row_extremes_lanes(like, F, N, X, M, cell, r):
     store(X, HIGH * M + r, high)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def read_outputs(F, X, J, M, floats, rows, begin, end, first, count):
     """Centres of rows ``begin:end``: their affine parts plus what they read of outputs ``first:count``.
 
@@ -78,7 +77,7 @@ def read_outputs(F, X, J, M, floats, rows, begin, end, first, count):
         read_outputs_lanes(splat(0.0), F, X, J, M, floats, rows, r, first, count, False)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def read_tracked_outputs(F, X, J, M, floats, rows, begin, end, first, count):
     """`read_outputs`, and X[REACH]: radii that add up the tracked radii of the outputs, X[READ_RADIUS]."""
     r = begin
@@ -89,7 +88,7 @@ def read_tracked_outputs(F, X, J, M, floats, rows, begin, end, first, count):
         read_outputs_lanes(splat_wide(0.0), F, X, J, M, floats, rows, r, first, count, True)
 
 
-@njit(cache=True, error_model="numpy", inline="always")
+@inlined_kernel
 def read_sixteen(F, X, J, M, floats, rows, r, first, count, tracked):
     """`read_outputs` for rows ``r : r + 16``, or `read_tracked_outputs`."""
     weights, s = weights_of(floats, rows) + r, r + 8
@@ -136,7 +135,7 @@ def read_sixteen(F, X, J, M, floats, rows, r, first, count, tracked):
         store(X, REACH * M + s, d5)
 
 
-@njit(cache=True, error_model="numpy", inline="always")
+@inlined_kernel
 def read_outputs_lanes(like, F, X, J, M, floats, rows, r, first, count, tracked):
     """`read_sixteen` for as many rows as ``like`` has lanes."""
     outputs, places, radii = OUTPUTS * M, READ_AT * M, READ_RADIUS * M

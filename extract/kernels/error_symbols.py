@@ -19,7 +19,6 @@ last place of that (Higham, Accuracy and Stability of Numerical Algorithms, sect
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
 from mn_onnx.extract.kernels.lanes import (
     as_singles,
@@ -63,6 +62,7 @@ from mn_onnx.extract.kernels.memory import (
     symbol_stride,
 )
 from mn_onnx.extract.kernels.relax import MARGIN
+from mn_onnx.ir.kernel import kernel
 
 # Half a unit in the last place of float32, and a little for products of several such errors.
 ROUNDING = 1.05 * 2.0**-24
@@ -78,7 +78,7 @@ ROWS_BEYOND = 8
 PANEL = 192
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def add_tile(E, J, target, stride, table, read, count, weights, room):
     """Add 16 symbols of what eight rows read of ``count`` rows before them to E[target].
 
@@ -110,7 +110,7 @@ def add_tile(E, J, target, stride, table, read, count, weights, room):
     store(E, t7, a7)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def clear_row(F, row, stride):
     """Write zeros to a row of the table."""
     E = as_singles(F)
@@ -118,7 +118,7 @@ def clear_row(F, row, stride):
         store(E, q, splat_singles(np.float32(0.0)))
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def gather_weights(F, E, X, J, M, weights, begin, end, live, first, count, read, room):
     """Weights times X[READ_SLOPE] of the ``live`` rows of ``begin:end`` on the outputs ``first:count``.
 
@@ -137,7 +137,7 @@ def gather_weights(F, E, X, J, M, weights, begin, end, live, first, count, read,
         read += room
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def begin_rows(E, X, J, M, live, known, symbols, errors, stride, read, room):
     """So many rows of the table from E[errors] on: what they read of the own errors ``known:symbols``, else zero.
 
@@ -170,7 +170,7 @@ def begin_rows(E, X, J, M, live, known, symbols, errors, stride, read, room):
             store(E, row + q, nothing)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def summed_errors(E, target, symbols, growth, rounding):
     """The sum of a row's errors' magnitudes, with their rounding: at most ``growth``."""
     one, summed = splat_singles(np.float32(1.0)), splat_singles(np.float32(0.0))
@@ -180,7 +180,7 @@ def summed_errors(E, target, symbols, growth, rounding):
     return radius if radius < growth else growth
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def track_errors(F, X, J, M, weights, begin, end, live, level, first, count, errors, stride, read, rounding):
     """Radii of the ``live`` rows of ``begin:end``, those of a level, from the error of every single unit before.
 
@@ -216,7 +216,7 @@ def track_errors(F, X, J, M, weights, begin, end, live, level, first, count, err
     return rounding
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def number_errors(X, J, M, level, level_begin, begin, end, nothing):
     """A symbol for each of the outputs ``begin:end`` of a level that has an error of its own.
 
@@ -251,7 +251,7 @@ def number_errors(X, J, M, level, level_begin, begin, end, nothing):
     return fit
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def add_four(E, J, target, symbols, errors, stride, read, count, weights):
     """Add ``symbols`` errors of four rows, or of ``count`` if that is less, weighted, to E[target].
 
@@ -272,7 +272,7 @@ def add_four(E, J, target, symbols, errors, stride, read, count, weights):
         store(E, target + q, a)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def centre_output(F, X, J, M, out_weights, constants, count):
     """The output's linear centre over ``count`` outputs of units, X[CENTRE_AT] (four numbers); returns its growth.
 
@@ -301,7 +301,7 @@ def centre_output(F, X, J, M, out_weights, constants, count):
     return most
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def track_output(F, X, J, M, out_weights, constants, levels, count, errors, own, stride, read, rounding):
     """The output's linear centre (X[CENTRE_AT], four numbers) and its radius, which is returned.
 
@@ -327,7 +327,7 @@ def track_output(F, X, J, M, out_weights, constants, levels, count, errors, own,
     return summed_errors(E, own, symbols, growth, rounding)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def tracking_floats(rows, cols):
     """Number of float64 that the table of errors of a system takes in scratch."""
     return (rows + ROWS_BEYOND + 2) * symbol_stride(cols) // 2 + (rows + 24) * cols // 2 + 24

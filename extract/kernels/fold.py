@@ -9,7 +9,6 @@ of dense matrices, in register tiles.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
 from mn_onnx.extract.kernels.lanes import fma, lanes_of, load_wide, splat, splat_wide, store
 from mn_onnx.extract.kernels.layout import lay_out_folded, new_row
@@ -52,6 +51,7 @@ from mn_onnx.extract.kernels.memory import (
     weights_of,
 )
 from mn_onnx.extract.kernels.products import TILE, accumulate
+from mn_onnx.ir.kernel import kernel
 
 # `gather_column` writes up to so many numbers after the last one.
 OVERWRITTEN = 8
@@ -60,7 +60,7 @@ COLUMN_BLOCK = 8
 FOUR = np.int64(4)  # of numpy's, see `memory`
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def list_settled_columns(N, X, J, M, system, least):
     """The columns, not identically zero, of rows of a kind below ``least``; returns their number.
 
@@ -85,7 +85,7 @@ def list_settled_columns(N, X, J, M, system, least):
     return count
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def read_settled_rows(F, N, X, J, M, system, floats, first, last, new_cols, work, stride):
     """What settled columns ``first : last``, of one level, read of the kept columns and the input, times their slope.
 
@@ -130,7 +130,7 @@ def read_settled_rows(F, N, X, J, M, system, floats, first, last, new_cols, work
     return 4 + padded(read)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def express_settled_rows(F, N, X, J, M, system, floats, settled, new_cols, work, stride, scratch):
     """Every settled column's output over the kept columns and the input.
 
@@ -161,7 +161,7 @@ def express_settled_rows(F, N, X, J, M, system, floats, settled, new_cols, work,
         first = last
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def gather_column(F, J, M, source, begin, end, target):
     """Copy what the old rows ``begin : end`` have of a column to their new rows.
 
@@ -172,7 +172,7 @@ def gather_column(F, J, M, source, begin, end, target):
         pack_store(F, target + J[PLACE * M + chunk], weights, mask_of(J[KEPT * M + chunk]))
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def gather_settled(F, N, J, M, system, floats, settled, new_rows, gathered):
     """What the kept rows read of every settled column, ``new_rows`` numbers each from F[gathered] on.
 
@@ -200,7 +200,7 @@ def gather_settled(F, N, J, M, system, floats, settled, new_rows, gathered):
         J[SINCE * M + p], J[UNTIL * M + p] = begin, until
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def write_columns(F, N, J, M, system, floats, folded, weights, gathered, settled, work, stride):
     """Write the folded system's columns: the kept ones, and what the rows read of them through the settled ones.
 
@@ -235,7 +235,7 @@ def write_columns(F, N, J, M, system, floats, folded, weights, gathered, settled
         k = last
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def fold(F, N, X, J, M, system, floats, folded, folded_floats, least):
     """Write the folded system at ``folded`` (N) and ``folded_floats`` (F); scratch follows it in F.
 
@@ -278,7 +278,7 @@ def fold(F, N, X, J, M, system, floats, folded, folded_floats, least):
             F[new_constant + axis] += w * F[at + axis]
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def folding_floats(rows, cols):
     """Upper bound of what `fold` writes to F for a system of this size."""
     return system_floats(rows, cols) + cols * aligned(cols + 4) + cols * max(rows, cols) + 4 * OVERWRITTEN

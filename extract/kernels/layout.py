@@ -6,7 +6,6 @@ Rows are chosen and moved eight at a time.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
 from mn_onnx.extract.kernels.lanes import store
 from mn_onnx.extract.kernels.masks import (
@@ -48,12 +47,13 @@ from mn_onnx.extract.kernels.memory import (
     system_floats,
     system_ints,
 )
+from mn_onnx.ir.kernel import kernel
 
 # Systems of so many units are large.
 ALIGNED_UNITS = 64
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def choose_rows(N, J, M, system, folded, least):
     """Which rows of the system stay: those of kind ``least`` or more, and others to pad each level to the lane width.
 
@@ -118,19 +118,19 @@ def choose_rows(N, J, M, system, folded, least):
     return new_rows
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def level_bits(r, begin, end):
     """Which of the eight rows from ``r`` on are in ``begin : end``, as bits."""
     return (0xFF << max(begin - r, 0)) & (0xFF >> max(r + 8 - end, 0))
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def new_row(J, M, r):
     """The folded system's row for row ``r``; for one that is left out, that of the next."""
     return J[PLACE * M + (r >> 3)] + count_bits(J[KEPT * M + (r >> 3)] & ((1 << (r & 7)) - 1))
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def lay_out_folded(N, J, M, system, folded, least, settled):
     """Write the integer part of the system that keeps the rows of kind ``least`` or more, at ``folded``.
 
@@ -174,7 +174,7 @@ def lay_out_folded(N, J, M, system, folded, least, settled):
     return new_rows, new_cols
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def substituted_reach(N, J, M, old_end, begin, end, settled):
     """Up to which old row a column that rows ``begin : end`` read is read once settled rows are substituted."""
     for p in range(settled):
@@ -186,7 +186,7 @@ def substituted_reach(N, J, M, old_end, begin, end, settled):
     return end
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def place_single_columns(N, new_unit, new_rows):
     """The first column of every row and the row of every column, where every unit has one; returns their number."""
     new_row_col = new_unit + new_rows
@@ -205,7 +205,7 @@ def place_single_columns(N, new_unit, new_rows):
     return cols
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def place_columns(N, J, M, row_col, new_unit, new_rows):
     """`place_single_columns` for units of any number of outputs; also J[OLD_COL], the old column of every new one."""
     new_row_col = new_unit + new_rows
@@ -224,7 +224,7 @@ def place_columns(N, J, M, row_col, new_unit, new_rows):
     return cols
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def carry_states(N, J, M, tables, system, folded, least):
     """After `fold`: move the state ranges in J to the rows of the folded system, hash the others' states into it."""
     rows = N[system + SYS_ROWS]

@@ -8,7 +8,6 @@ more than one possible state. Cutting a polygon is several times cheaper than sp
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
 from mn_onnx.extract.kernels.lanes import fma, lanes_of, load, splat, store
 from mn_onnx.extract.kernels.memory import (
@@ -44,6 +43,7 @@ from mn_onnx.extract.kernels.polytope import (
     read_cut_polygon,
     value_range,
 )
+from mn_onnx.ir.kernel import kernel
 
 # So many recent points are looked at for each corner: they fit in the nearest cache and find 96 % of what there is.
 REMEMBERED = 2048
@@ -51,7 +51,7 @@ REMEMBERED = 2048
 APART = 2.0**-40
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def place_corner(output, points, key0, key1, x, y, z):
     """The number of the point with these keys at this place: a recent one of ``points``, or the next.
 
@@ -80,7 +80,7 @@ def place_corner(output, points, key0, key1, x, y, z):
     return point
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def emit_polygon(X, J, M, output, tables, count, polygon, tags, hash0, hash1, gradient):
     """Append a polygon to the output buffers; the caller has made sure that they have room."""
     corner, points = output.counts[1], output.counts[2]
@@ -103,7 +103,7 @@ def emit_polygon(X, J, M, output, tables, count, polygon, tags, hash0, hash1, gr
     output.counts[2] = points
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def choose_state(N, X, J, M, system, tables, r, state):
     """Let row ``r`` be in a state, and its outputs, X[CHOSEN], the affine forms that they are then."""
     J[CHOICE * M + r] = state
@@ -119,7 +119,7 @@ def choose_state(N, X, J, M, system, tables, r, state):
         piece += pieces
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def substitute(F, X, M, form, first, count, weights, stride):
     """The affine ``form`` plus what it reads of the outputs ``first : count``, as chosen.
 
@@ -130,7 +130,7 @@ def substitute(F, X, M, form, first, count, weights, stride):
     return form
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def substitute_row(F, N, X, M, system, floats, r, target):
     """Affine form of row ``r`` at ``X[target : target + 4]`` under the states chosen for the rows before it."""
     rows, cols, at = N[system + SYS_ROWS], N[system + SYS_COLS], floats + r
@@ -145,7 +145,7 @@ def substitute_row(F, N, X, M, system, floats, r, target):
     store(X, target, substitute(F, X, M, form, first, count, weights_of(floats, rows) + r, rows))
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def substitute_output(F, N, X, M, system, floats, target):
     """Affine form of the output at ``X[target : target + 4]`` under the chosen states of all rows."""
     rows, cols = N[system + SYS_ROWS], N[system + SYS_COLS]
@@ -154,7 +154,7 @@ def substitute_output(F, N, X, M, system, floats, target):
     store(X, target, substitute(F, X, M, form, np.int64(0), cols, out_weights, np.int64(1)))
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def emit_choice(F, N, X, J, M, output, tables, slot_of_tag, cell, cell_rows, system, floats):
     """Emit the polygon of the chosen states, if the surface has one there.
 
@@ -204,7 +204,7 @@ def emit_choice(F, N, X, J, M, output, tables, slot_of_tag, cell, cell_rows, sys
     return 0
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def open_choice(F, N, X, J, M, tables, cell, system, floats, r):
     """Find the states that row ``r`` can take in the cell, given those chosen before, and choose the first."""
     unit = N[system + SYS_HEADER + N[system + SYS_LEVELS] + 1 + r]
@@ -227,7 +227,7 @@ def open_choice(F, N, X, J, M, tables, cell, system, floats, r):
     choose_state(N, X, J, M, system, tables, r, first)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def emit_leaf(F, N, X, J, M, output, tables, slot_of_tag, cell, cell_rows, system, floats):
     """Enumerate the states of a small folded system over a cell and emit every polygon.
 

@@ -83,6 +83,7 @@ from mn_onnx.extract.kernels.split import (
     split_cell,
     trim_cell,
 )
+from mn_onnx.ir.kernel import inlined_kernel, kernel
 
 DONE, BUDGET_USED, ARENA_FULL, SCRATCH_FULL, OUTPUT_FULL, STACK_FULL, STOPPED = 0, 1, 2, 3, 4, 5, 6
 
@@ -110,7 +111,7 @@ class Room(NamedTuple):
     points: int
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def point_at_tables(tables):
     """The tables with pointers in place of arrays."""
     return Tables(
@@ -126,7 +127,7 @@ def point_at_tables(tables):
     )
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def point_at_output(output):
     """The output buffers with pointers in place of arrays."""
     return OutputArrays(
@@ -141,7 +142,7 @@ def point_at_output(output):
     )
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def missing_room(N, control, room, counts, cell, rows, cols, levels):
     """The status to return if the next cell might not fit anywhere, else DONE; sets the NEED_* entries."""
     vertices = N[cell + CELL_VERTICES]
@@ -168,7 +169,7 @@ def missing_room(N, control, room, counts, cell, rows, cols, levels):
     return DONE
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def count_choices(N, J, M, system, most):
     """Product of the numbers of states the rows still have, or anything above ``most``."""
     row_unit = system + SYS_HEADER + N[system + SYS_LEVELS] + 1
@@ -181,7 +182,7 @@ def count_choices(N, J, M, system, most):
     return product
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def how_to_fold(N, system, linear, dead):
     """UNSTABLE to fold all settled rows of the system, LINEAR to leave out the dead ones, DEAD to keep it as it is.
 
@@ -197,7 +198,7 @@ def how_to_fold(N, system, linear, dead):
     return LINEAR if 7 * dead >= units else DEAD
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def how_to_bound(N, cell, system, large):
     """TRACKED for bounds from every unit's own error, SUMMED for sums of errors, FIRST_LEVEL for affine rows only."""
     units = N[system + SYS_UNITS]
@@ -208,13 +209,13 @@ def how_to_bound(N, cell, system, large):
     return FIRST_LEVEL if large else SUMMED
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def is_leaf(N, J, M, control, system):
     """Whether the rows have so few states left that all of the cell is emitted at once."""
     return count_choices(N, J, M, system, control[LEAF_CHOICES]) <= control[LEAF_CHOICES]
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def load_states(N, J, M, cell, rows):
     """Put the states of a cell's rows into J, where bounds narrow them."""
     states = cell + CELL_HEADER
@@ -224,7 +225,7 @@ def load_states(N, J, M, cell, rows):
 
 
 # Inlined before LLVM sees it: as a function of its own, all that it calls would be optimised once more.
-@njit(cache=True, error_model="numpy", inline="always")
+@inlined_kernel
 def visit(F, N, X, J, M, control, stack, output, tables, S, K, slot_of_tag, cell):
     """Process one cell that has been taken off the stack."""
     floats, system = N[cell + CELL_SYSTEM_F], N[cell + CELL_SYSTEM_I]
@@ -306,7 +307,7 @@ def visit(F, N, X, J, M, control, stack, output, tables, S, K, slot_of_tag, cell
         control[BROKEN_CUTS] += 1  # only if the network is not finite here: the first unstable row is affine
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy", no_cfunc_wrapper=True)
 def march(worker, tables, output, budget):
     """Visit cells until the worker's stack is empty; returns one of the status codes of this module.
 

@@ -29,7 +29,8 @@ trimmed by, two for every depth up to `TRIMMED_DEPTHS`: the surface never reache
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
+
+from mn_onnx.ir.kernel import kernel
 
 SYS_ROWS, SYS_COLS, SYS_LEVELS, SYS_FLOATS, SYS_INTS, SYS_UNITS, SYS_HASH = 0, 1, 2, 3, 4, 5, 6
 SYS_SINGLE, SYS_HEADER = 8, 9  # 1 if every unit of the network has one output
@@ -72,49 +73,49 @@ DEAD, LINEAR, UNSTABLE = 0, 1, 2
 TRIMMED_DEPTHS = 1024
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def padded(count: int) -> int:
     """``count`` rounded up to a multiple of the lane width."""
     return (count + 3) & ~3
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def aligned(place: int) -> int:
     """``place`` rounded up to where a line of the machine's caches begins: wide loads across two lines take twice."""
     return (place + 7) & ~7
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def knots_of(floats: int, rows: int) -> int:
     """Where in F the table of knots of a system of so many rows begins."""
     return floats + 4 * rows
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def weights_of(floats: int, rows: int) -> int:
     """Where in F the weights of a system of so many rows begin."""
     return floats + ROW_FLOATS * rows
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def system_ints(rows: int, cols: int, levels: int) -> int:
     """Number of int64 a system takes."""
     return SYS_HEADER + levels + 1 + 2 * rows + 1 + 3 * cols
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def system_floats(rows: int, cols: int) -> int:
     """Number of float64 a system takes, padded to the lane width."""
     return ROW_FLOATS * rows + cols * rows + padded(cols) + 4
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def cell_ints(rows: int, vertices: int) -> int:
     """Number of int64 a cell takes."""
     return CELL_HEADER + 2 * rows + 6 * vertices
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def symbol_stride(cols: int) -> int:
     """Room, in float32, for the error symbols of a system: at most one a column, padded to the tiles of products.
 
@@ -123,7 +124,7 @@ def symbol_stride(cols: int) -> int:
     return (cols + 31) & ~31 | 16
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def first_trim_tag(n_knots: int) -> int:
     """The tags of planes that trimmed a cell start here, after the knots and six box faces."""
     return 2 * (n_knots + 6)

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
+
+from mn_onnx.ir.kernel import threaded_kernel
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -12,7 +13,7 @@ Integers = NDArray[np.int64]
 DEEPEST = 128
 
 
-@numba.njit(cache=True, nogil=True)
+@threaded_kernel
 def order_by_halves(points: Floats, order: Integers) -> None:
     """Sort the point numbers ``order`` (int64 [n], of ``points`` float64 [m, d]) as the leaves of a k-d tree.
 
@@ -37,7 +38,7 @@ def order_by_halves(points: Floats, order: Integers) -> None:
         depth += 2
 
 
-@numba.njit(cache=True, nogil=True)
+@threaded_kernel
 def _longest_side(points: Floats, order: Integers, begin: int, end: int) -> int:
     longest, length = 0, -1.0
     for axis in range(points.shape[1]):
@@ -49,7 +50,7 @@ def _longest_side(points: Floats, order: Integers, begin: int, end: int) -> int:
     return longest
 
 
-@numba.njit(cache=True, nogil=True)
+@threaded_kernel
 def _select(points: Floats, order: Integers, low: int, high: int, rank: int, axis: int) -> None:
     """Move points ``low`` .. ``high`` until none before ``rank`` is above one after it (Hoare, "Find", 1961)."""
     while low < high:

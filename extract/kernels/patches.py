@@ -10,9 +10,10 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
+
+from mn_onnx.ir.kernel import threaded_kernel
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -50,7 +51,7 @@ class Polygons(NamedTuple):
     corners: NDArray[np.integer]
 
 
-@numba.njit(cache=True, nogil=True)
+@threaded_kernel
 def patch_moments(
     polygons: Polygons, order: NDArray[np.integer], begins: Integers, ends: Integers, centre: Floats, moments: Floats
 ) -> None:
@@ -77,7 +78,7 @@ def patch_moments(
                         moments[patch, axis, other] += along * across
 
 
-@numba.njit(cache=True, nogil=True)
+@threaded_kernel
 def patch_extents(
     polygons: Polygons,
     order: NDArray[np.integer],
@@ -107,7 +108,7 @@ def patch_extents(
             half[patch, axis] += 64 * EPS * reach
 
 
-@numba.njit(cache=True, nogil=True)
+@threaded_kernel
 def find_interval(starts: Floats, first: int, end: int, guess: int, t: float) -> int:
     """The interval of ``t`` among ``first`` .. ``end - 1``, by steps from ``guess`` that double, then by halves."""
     low, high, step = guess, guess + 1, 1
@@ -124,7 +125,7 @@ def find_interval(starts: Floats, first: int, end: int, guess: int, t: float) ->
     return low
 
 
-@numba.njit(cache=True, nogil=True)
+@threaded_kernel
 def relax_level(
     tables: Tables,
     owner: Integers,
@@ -184,7 +185,7 @@ def relax_level(
             misses[patch, output] = error + 32 * EPS * size
 
 
-@numba.njit(cache=True, nogil=True)
+@threaded_kernel
 def pre_activation_ranges(
     forms: Floats, sizes: Floats, half: Floats, lowest: Floats, highest: Floats, low: Floats, high: Floats
 ) -> None:
@@ -200,7 +201,7 @@ def pre_activation_ranges(
         high[unit] = max(low[unit], min(at + reach, highest[unit]))
 
 
-@numba.njit(cache=True, nogil=True)
+@threaded_kernel
 def output_forms(
     relaxed: Relaxed,
     owner: Integers,
@@ -237,7 +238,7 @@ def output_forms(
             )
 
 
-@numba.njit(cache=True, nogil=True)
+@threaded_kernel
 def polygon_maxima(
     polygons: Polygons,
     order: NDArray[np.integer],

@@ -9,7 +9,6 @@ two ends of an edge on planes (b, c) list these two in opposite order.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
 from mn_onnx.extract.kernels.lanes import fma, lane, larger, load, load_wide, smaller, splat, splat_wide, store
 from mn_onnx.extract.kernels.masks import (
@@ -45,11 +44,12 @@ from mn_onnx.extract.kernels.memory import (
     SIDE_COUNTS,
     padded,
 )
+from mn_onnx.ir.kernel import kernel
 
 TINY = 1e-300
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def most_vertices(vertices, cuts):
     """Upper bound of the vertices of a part of a simple polytope that is cut so often.
 
@@ -60,7 +60,7 @@ def most_vertices(vertices, cuts):
     return vertices
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def evaluate_affine(F, N, X, M, cell, region, a0, a1, a2, a3):
     """``X[region]`` = a . x + a3 at the cell's vertices (and at its padding, which repeats the last one)."""
     x = N[cell + CELL_FLOATS]
@@ -72,7 +72,7 @@ def evaluate_affine(F, N, X, M, cell, region, a0, a1, a2, a3):
         store(X, out + v, value)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def value_range(X, M, region, count):
     """Smallest and largest of the first ``count`` (a multiple of the lane width) values of a region."""
     low = load(X, region * M)
@@ -87,7 +87,7 @@ def value_range(X, M, region, count):
     )
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def find_cut_edges(F, N, X, J, M, cell, rows, values):
     """Collect the edges on which ``X[values]`` changes sign, from the negative to the positive end.
 
@@ -140,7 +140,7 @@ def find_cut_edges(F, N, X, J, M, cell, rows, values):
     return count
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def link_cut_edges(J, M, slot_of_tag, count):
     """Order the corners of a cut: CUT_NEXT and CUT_PREVIOUS. ``slot_of_tag`` is scratch of one entry per tag.
 
@@ -162,7 +162,7 @@ def link_cut_edges(J, M, slot_of_tag, count):
     return count == 0 or (j == 0 and met == count and count >= 3)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def write_half(F, N, X, J, M, cell, rows, half_rows, count, side, tag, half, half_floats):
     """Write one half of the polytope that `find_cut_edges` has looked at.
 
@@ -222,7 +222,7 @@ def write_half(F, N, X, J, M, cell, rows, half_rows, count, side, tag, half, hal
     return total
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def read_cut_polygon(X, J, M, count, polygon, tags):
     """Copy a linked cut to a polygon: corners in ``X[polygon : polygon + 3]``, the tag of each edge in ``J[tags]``."""
     j = 0
@@ -233,7 +233,7 @@ def read_cut_polygon(X, J, M, count, polygon, tags):
         j = J[CUT_NEXT * M + j]
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def count_corners_inside(X, M, count, polygon, a0, a1, a2, a3, side, gradient):
     """How many corners of a polygon lie where a . x + a3, in X[POLY_VALUES], is negative (side 0) or not (side 1).
 
@@ -256,7 +256,7 @@ def count_corners_inside(X, M, count, polygon, a0, a1, a2, a3, side, gradient):
     return inside
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def clip_polygon(X, J, M, count, polygon, tags, result, result_tags, side, tag):
     """Keep the part of a convex polygon on one side of the plane that `count_corners_inside` has looked at.
 
@@ -286,7 +286,7 @@ def clip_polygon(X, J, M, count, polygon, tags, result, result_tags, side, tag):
     return out
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def copy_polytope(F, N, cell, rows, new_rows, copy, copy_floats):
     """Write a cell's polytope again at ``copy`` (N) and ``copy_floats`` (F), for a system of ``new_rows`` rows.
 

@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-from numba import njit
-
 from mn_onnx.extract.kernels.lanes import fma, load_like, load_wide, splat, splat_like, splat_wide, store
 from mn_onnx.extract.kernels.memory import SINCE, UNTIL
+from mn_onnx.ir.kernel import inlined_kernel, kernel
 
 # So many numbers of a column are summed in registers at a time.
 TILE = 16
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def accumulate(F, J, M, target, targets, begin, end, rows, sources, first, count, coefficients, stride):
     """Add to each of ``targets`` columns of ``rows`` numbers the columns at F[sources] times coefficients.
 
@@ -43,7 +42,7 @@ def accumulate(F, J, M, target, targets, begin, end, rows, sources, first, count
         q += width
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def accumulate_tile(F, t0, targets, rows, source, count, at, stride):
     """`accumulate` for sixteen ``q`` and up to four targets; where there are fewer, the last one again."""
     one, two, three = min(1, targets - 1), min(2, targets - 1), min(3, targets - 1)
@@ -70,7 +69,7 @@ def accumulate_tile(F, t0, targets, rows, source, count, at, stride):
     store(F, t3 + 8, b3)
 
 
-@njit(cache=True, error_model="numpy", inline="always")
+@inlined_kernel
 def accumulate_lanes(like, F, t0, targets, rows, source, count, at, stride):
     """`accumulate_tile` for as many ``q`` as ``like`` has lanes."""
     one, two, three = min(1, targets - 1), min(2, targets - 1), min(3, targets - 1)

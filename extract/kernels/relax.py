@@ -5,8 +5,6 @@ A unit of several pieces is relaxed by its chord over the range of its pre-activ
 
 from __future__ import annotations
 
-from numba import njit
-
 from mn_onnx.extract.kernels.lanes import fma, magnitude, splat_wide
 from mn_onnx.extract.kernels.masks import choose, divide, either
 from mn_onnx.extract.kernels.memory import (
@@ -22,6 +20,7 @@ from mn_onnx.extract.kernels.memory import (
     STATE_LOW,
     UNSTABLE,
 )
+from mn_onnx.ir.kernel import kernel
 
 # Rounding of a bound, relative to the size of the centre it is around: 2^-40 is about 4000 units in the last place.
 # Where terms cancel that are thousands of times larger than their sum, it may be more: then cells may decide a sign
@@ -29,7 +28,7 @@ from mn_onnx.extract.kernels.memory import (
 MARGIN = 2.0**-40
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def bound_radius(X, M, extent, r):
     """The radius of row ``r`` with what rounding may add; exactly 0 for a row that is affine on the cell."""
     radius = X[RADIUS * M + r]
@@ -37,7 +36,7 @@ def bound_radius(X, M, extent, r):
     return radius + MARGIN * size * extent if radius > 0.0 else 0.0
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def with_rounding(c0, c1, c2, c3, radius, extent):
     """Radii around affine forms, with what rounding may add, in eight lanes."""
     one = splat_wide(1.0)
@@ -46,7 +45,7 @@ def with_rounding(c0, c1, c2, c3, radius, extent):
     return fma(size, splat_wide(MARGIN * extent), radius)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def relax_one_knot(knot, left, left_at, right, right_at, low, high, above, under):
     """Slopes, offsets and errors over [low, high] of units of one knot and two pieces, in eight lanes.
 
@@ -67,7 +66,7 @@ def relax_one_knot(knot, left, left_at, right, right_at, low, high, above, under
     return slope, offset, error
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def relax_piece_range(knots, slopes, intercepts, knot, piece, first, last, low, high):
     """Relax a table's pieces ``first..last``, more than one, by their chord over [low, high].
 
@@ -85,7 +84,7 @@ def relax_piece_range(knots, slopes, intercepts, knot, piece, first, last, low, 
     return slope, at_low - slope * low + 0.5 * (above + below), 0.5 * (above - below)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def narrow_states(knots, knot, pieces, first, last, low, high):
     """The states ``first..last`` that pre-activations in [low, high] may have, and the part of the range in them."""
     while first < last and low >= knots[knot + first]:
@@ -100,7 +99,7 @@ def narrow_states(knots, knot, pieces, first, last, low, high):
     return first, last, low, high
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def settle_row(N, X, J, M, tables, cols, r, unit):
     """Tighten the state range of row ``r`` by its bounds and relax its outputs.
 

@@ -7,7 +7,6 @@ way such a unit goes is as good as random.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
 from mn_onnx.extract.kernels.lanes import fma, load_wide, magnitude, splat_wide, store
 from mn_onnx.extract.kernels.masks import (
@@ -52,12 +51,13 @@ from mn_onnx.extract.kernels.memory import (
     knots_of,
 )
 from mn_onnx.extract.kernels.relax import relax_one_knot, settle_row, with_rounding
+from mn_onnx.ir.kernel import kernel
 
 # Whether rows are settled on a cell for the first time, or again after it has been trimmed.
 FIRST, AGAIN = np.bool_(False), np.bool_(True)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def enclose_eight(X, M, extent, r, radius):
     """Ranges of rows ``r : r + 8``: X[LOW] and X[HIGH] of their centres, and ``radius`` with what rounding may add.
 
@@ -70,7 +70,7 @@ def enclose_eight(X, M, extent, r, radius):
     return low, fma(splat_wide(1.0), reach, load_wide(X, HIGH * M + r))
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def sides_of_knots(J, M, r, knot, low, high):
     """Where rows ``r : r + 8`` of one knot are above it, or else under it, all over the cell: by state or by range."""
     no, yes = splat_integer(0), splat_integer(1)
@@ -79,7 +79,7 @@ def sides_of_knots(J, M, r, knot, low, high):
     return above, without(either(same(last, no), is_below(high, knot)), above)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def list_live_rows(F, N, X, J, M, extent, row_unit, floats, rows, begin, end):
     """List the units of ``begin : end`` whose output may be other than zero, with X[REACH] as radii; returns how many.
 
@@ -120,7 +120,7 @@ def list_live_rows(F, N, X, J, M, extent, row_unit, floats, rows, begin, end):
     return end - begin
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def settle_eight(F, X, J, M, extent, table, rows, r, inside):
     """Settle and relax rows ``r : r + 8`` where ``inside`` holds, all of them of one knot and one output, or padding.
 
@@ -144,7 +144,7 @@ def settle_eight(F, X, J, M, extent, table, rows, r, inside):
     return slope, offset, error, settled, dead, kind
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def list_eight(X, J, M, cols, rows, r, slope, offset, error, listed, count):
     """`list_outputs` for the rows of ``r : r + 8`` in the mask ``listed``, whose columns are ``cols``."""
     pack_store(J, READ_COLS * M + count, cols, listed)
@@ -160,7 +160,7 @@ def list_eight(X, J, M, cols, rows, r, slope, offset, error, listed, count):
     return count + count_bits(bits_of(listed))
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def list_outputs(N, X, J, M, row_col, rows, r, count):
     """Append the relaxed outputs of row ``r`` that are not identically zero to the list that later rows read.
 
@@ -183,7 +183,7 @@ def list_outputs(N, X, J, M, row_col, rows, r, count):
     return count
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def settle_rows(F, N, X, J, M, tables, row_unit, row_col, floats, rows, begin, end, again, count):
     """Settle and relax rows ``begin : end``; list their outputs from place ``count`` on.
 

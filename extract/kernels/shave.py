@@ -9,7 +9,6 @@ IJCAI 1993). The slices lie along the planes where the output's linear centre is
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
 from mn_onnx.extract.kernels.control import SHAVED_LEVELS, SHAVED_UNITS
 from mn_onnx.extract.kernels.masks import lowest_bit
@@ -34,6 +33,7 @@ from mn_onnx.extract.kernels.polytope import (
 from mn_onnx.extract.kernels.slice_points import ALL_SLICES, SLICES, place_points, plane_value
 from mn_onnx.extract.kernels.slices import keep_states, missed_slices
 from mn_onnx.extract.kernels.split import THINNEST, write_part
+from mn_onnx.ir.kernel import kernel
 
 # Only cells of which the surface may be in at least this share, in terms of the output's range; of others the bounds
 # are tight already. Measured: 0.4 and 0.6 do equally well.
@@ -44,13 +44,13 @@ STATELESS, LOWER, UPPER = np.int64(0), np.int64(0), np.int64(1)
 NO_SURFACE = -1
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def is_worth_shaving(N, control, system):
     """Whether slices of cells of this system are likely to save more than they cost."""
     return N[system + SYS_LEVELS] >= control[SHAVED_LEVELS] and N[system + SYS_UNITS] >= control[SHAVED_UNITS]
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def cut_off(F, N, X, J, M, control, slot_of_tag, cell, rows, limit, kept_side, tag, most):
     """The part of the cell on one side of the plane where the output's centre is ``limit``, without states.
 
@@ -66,7 +66,7 @@ def cut_off(F, N, X, J, M, control, slot_of_tag, cell, rows, limit, kept_side, t
     return part, STATELESS
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def shave_cell(F, N, X, J, M, S, K, control, tables, slot_of_tag, cell, rows, system, floats, most):
     """The cell without the slices at either end that the surface misses; NO_SURFACE if it misses all of them.
 

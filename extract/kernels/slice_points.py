@@ -7,7 +7,6 @@ cut into regions of multiples of ``M`` entries as X and J are (`memory`).
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
 from mn_onnx.extract.kernels.lanes import fma, larger, load_wide, smaller, splat_wide, store
 from mn_onnx.extract.kernels.masks import at_least, bits_of, count_bits
@@ -18,6 +17,7 @@ from mn_onnx.extract.kernels.memory import (
     CELL_VERTICES,
     CENTRE_AT,
 )
+from mn_onnx.ir.kernel import kernel
 
 SLICES, ALL_SLICES = 8, 0xFF  # one to a lane; as bits
 
@@ -35,13 +35,13 @@ SLICE_INTEGERS = 8
 POINT, FORM = 3 * SLICES, 5 * SLICES
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def plane_value(low, thickness, k):
     """The value of the output's centre on plane ``k``, the lower one of slice ``k``."""
     return low + k * thickness
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def find_slices(F, N, X, S, K, M, cell, low, thickness):
     """K[SLICE_OF] of the cell's vertices, and in S[PLANE_VALUES] how far each is above the planes.
 
@@ -61,7 +61,7 @@ def find_slices(F, N, X, S, K, M, cell, low, thickness):
         K[SLICE_OF * M + v] = max(count_bits(bits_of(at_least(value, splat_wide(0.0)))) - 1, 0)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def place_points(F, N, X, S, K, M, cell, rows, low, thickness):
     """The vertices of all slices: lane ``k`` of S[POINTS] lists those of slice ``k``.
 
@@ -99,7 +99,7 @@ def place_points(F, N, X, S, K, M, cell, rows, low, thickness):
     return least > 0
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def place_point(S, K, M, k, x, y, z):
     """Append a point to the list of slice ``k``."""
     at = POINTS * M + POINT * K[POINT_COUNTS * M + k] + k
@@ -107,7 +107,7 @@ def place_point(S, K, M, k, x, y, z):
     K[POINT_COUNTS * M + k] += 1
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def value_ranges(S, K, M, c0, c1, c2, c3):
     """Smallest and largest value of an affine form for each slice, over that slice."""
     p = POINTS * M

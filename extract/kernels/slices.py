@@ -8,7 +8,6 @@ here they hold eight slices, so that weights are read, and rows looked up, once 
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
 from mn_onnx.extract.kernels.lanes import (
     fma,
@@ -56,9 +55,10 @@ from mn_onnx.extract.kernels.slice_points import (
     WEIGHTS,
     value_ranges,
 )
+from mn_onnx.ir.kernel import kernel
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def relax_simple(F, K, M, table, rows, r, first, last, low, high):
     """Slopes, offsets and errors of a unit of one knot and one output, from its range in each slice.
 
@@ -74,7 +74,7 @@ def relax_simple(F, K, M, table, rows, r, first, last, low, high):
     return relax_one_knot(knot, left, left_at, right, right_at, low, high, above, under)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def relax_tables(N, S, M, tables, row_col, r, unit, first, last, low, high):
     """S[PIECES] of the columns of a unit of any table, from its range in each slice."""
     store(S, RANGES * M, low)
@@ -98,7 +98,7 @@ def relax_tables(N, S, M, tables, row_col, r, unit, first, last, low, high):
             piece += pieces
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def list_output(S, K, M, rows, r, c, count, c0, c1, c2, c3, growth, slope, offset, error):
     """Append a column's outputs to the list, unless they are zero in all slices; returns its length."""
     zero = splat_wide(0.0)
@@ -114,7 +114,7 @@ def list_output(S, K, M, rows, r, c, count, c0, c1, c2, c3, growth, slope, offse
     return count + 1
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def settle_slices(F, N, S, J, K, M, tables, row_unit, row_col, floats, rows, r, count, at):
     """Bound a row, whose form is at S[at], in each slice, and relax its outputs; returns how many are listed."""
     unit = N[row_unit + r]
@@ -142,7 +142,7 @@ def settle_slices(F, N, S, J, K, M, tables, row_unit, row_col, floats, rows, r, 
     return count
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def read_four(F, S, K, M, floats, rows, r, s, t, u, first, known):
     """S[FORMS]: the affine forms and radii of four rows in each slice, from outputs ``first : known``."""
     at = floats
@@ -174,7 +174,7 @@ def read_four(F, S, K, M, floats, rows, r, s, t, u, first, known):
     store_form(S, FORMS * M + 3 * FORM, d0, d1, d2, d3, d4)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def store_form(S, at, c0, c1, c2, c3, c4):
     """Write five vectors."""
     store(S, at, c0)
@@ -184,7 +184,7 @@ def store_form(S, at, c0, c1, c2, c3, c4):
     store(S, at + 32, c4)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def bound_rows(F, N, S, J, K, M, tables, system, floats):
     """Bound all rows of the system in each slice; returns how many outputs are not zero in all of them."""
     rows, cols, levels = N[system + SYS_ROWS], N[system + SYS_COLS], N[system + SYS_LEVELS]
@@ -215,7 +215,7 @@ def bound_rows(F, N, S, J, K, M, tables, system, floats):
     return count
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def multiply_columns(F, S, M, weights, columns, begin, end):
     """S[FORMS]: products of the derivatives of rows ``begin : end`` with four columns, given by where they begin."""
     a, b, c, d = splat_wide(0.0), splat_wide(0.0), splat_wide(0.0), splat_wide(0.0)
@@ -233,7 +233,7 @@ def multiply_columns(F, S, M, weights, columns, begin, end):
     store(S, at + 24, d)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def pass_back(F, S, K, M, p, out_weights, product, constant, radius):
     """Go on from listed output ``p``, whose product is at S[product], to its row, the constant and the radius."""
     column, row = PIECES * M + POINT * K[COLS * M + p], DERIVATIVES * M + SLICES * K[ROWS * M + p]
@@ -243,7 +243,7 @@ def pass_back(F, S, K, M, p, out_weights, product, constant, radius):
     return constant, fma(magnitude(coefficients), load_wide(S, column + 16), radius)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def bound_output(F, N, S, K, M, extent, system, floats, count):
     """After `bound_rows`, for every slice the range of the output's centre, and how far the output may be from that."""
     rows, cols = N[system + SYS_ROWS], N[system + SYS_COLS]
@@ -283,7 +283,7 @@ def bound_output(F, N, S, K, M, extent, system, floats, count):
     return low, high, with_rounding(s0, s1, s2, s3, radius, extent)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def missed_slices(F, N, S, J, K, M, tables, system, floats):
     """The slices that the surface provably misses, as bits, after `place_points`.
 
@@ -295,7 +295,7 @@ def missed_slices(F, N, S, J, K, M, tables, system, floats):
     return bits_of(either(is_below(slack, low), below_zero))
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def keep_states(N, J, K, M, system, slices):
     """Settle the rows of one knot that are settled alike in all of ``slices``, given as bits; returns how many.
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
 from mn_onnx.extract.kernels.control import BROKEN_CUTS, STACK_TOP, TOP_F, TOP_I
 from mn_onnx.extract.kernels.lanes import load_wide, splat_wide
@@ -46,6 +45,7 @@ from mn_onnx.extract.kernels.memory import (
     first_trim_tag,
 )
 from mn_onnx.extract.kernels.polytope import copy_polytope, evaluate_affine, find_cut_edges, link_cut_edges, write_half
+from mn_onnx.ir.kernel import kernel
 
 # A cell is trimmed if at most this share of the output's range stays. Measured: 0.5 to 0.8 do equally well.
 TRIMMED_SHARE = 0.7
@@ -56,7 +56,7 @@ SHAVED_TRIMMED_SHARE = 0.9
 THINNEST_SHARE, THINNEST = 0.03, 2.0**-30
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def affine_unstable(N, X, J, M, row_unit, r, rows):
     """Which of the eight rows from ``r`` on are unstable and affine on the cell, as bits."""
     real = both(at_least(load_integers(N, row_unit + r), splat_integer(0)), is_below(count_up(r), splat_integer(rows)))
@@ -64,7 +64,7 @@ def affine_unstable(N, X, J, M, row_unit, r, rows):
     return bits_of(without(both(real, unstable), is_below(splat_wide(0.0), load_wide(X, RADIUS * M + r))))
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def choose_split(N, X, J, M, tables, system):
     """Row and knot to split at: of the unstable rows that are affine on the cell, the one that cuts deepest."""
     row_unit = system + SYS_HEADER + N[system + SYS_LEVELS] + 1
@@ -99,7 +99,7 @@ def choose_split(N, X, J, M, tables, system):
             best, best_row, best_knot = score, r, a
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def push_cell(N, J, M, control, stack, part, vertices, depth, system, floats, row, low, high):
     """Finish a cell whose polytope has been written at ``part``, and push it.
 
@@ -120,7 +120,7 @@ def push_cell(N, J, M, control, stack, part, vertices, depth, system, floats, ro
     control[STACK_TOP] += 1
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def split_cell(F, N, X, J, M, control, stack, tables, slot_of_tag, cell, cell_rows, system, floats, row, form, knot):
     """Push both halves of a cell, with the folded ``system``.
 
@@ -148,7 +148,7 @@ def split_cell(F, N, X, J, M, control, stack, tables, slot_of_tag, cell, cell_ro
         push_cell(N, J, M, control, stack, part, vertices, depth, system, floats, row, low, high)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def write_part(F, N, X, J, M, control, cell, rows, part_rows, count, side, tag):
     """Write one half of a cut cell at the top of the arenas, with room for the states of ``part_rows`` rows.
 
@@ -162,7 +162,7 @@ def write_part(F, N, X, J, M, control, cell, rows, part_rows, count, side, tag):
     return part
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def cut_away(F, N, X, J, M, control, slot_of_tag, cell, rows, sign, reach, tag):
     """The part of the cell where ``sign * c(x) >= -reach``, c the output's centre, with room for the cell's states.
 
@@ -178,7 +178,7 @@ def cut_away(F, N, X, J, M, control, slot_of_tag, cell, rows, sign, reach, tag):
     return write_part(F, N, X, J, M, control, cell, rows, rows, count, np.int64(1), tag)
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def trim_cell(F, N, X, J, M, control, tables, slot_of_tag, cell, rows, low, high, slack, share):
     """The part of the cell between two planes that the surface cannot reach; the cell itself if most of it would stay.
 
@@ -200,7 +200,7 @@ def trim_cell(F, N, X, J, M, control, tables, slot_of_tag, cell, rows, low, high
     return cell
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def push_trimmed(F, N, J, M, control, stack, cell, cell_rows, system, floats):
     """Push a trimmed cell as it is, with the folded ``system``: none of the affine rows has a knot in it any more."""
     part, at = control[TOP_I], control[TOP_F]

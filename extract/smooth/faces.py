@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from mn_onnx.extract.blocks import Indices
+from mn_onnx.ir.kernel import threaded_kernel
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
 
-@numba.njit(cache=True, nogil=True)
+@threaded_kernel
 def _means(of_vertices: Floats, offsets: Integers, corners: Indices, polygons: Integers, means: Floats) -> None:
     for place in range(polygons.size):
         begin, end = offsets[polygons[place]], offsets[polygons[place] + 1]
@@ -23,7 +23,7 @@ def _means(of_vertices: Floats, offsets: Integers, corners: Indices, polygons: I
             means[place, axis] = total / (end - begin)
 
 
-@numba.njit(cache=True, nogil=True)
+@threaded_kernel
 def _facing(
     positions: Floats, gradients: Floats, offsets: Integers, corners: Indices, polygons: Integers, result: Floats
 ) -> None:

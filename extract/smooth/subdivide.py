@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
@@ -16,6 +15,7 @@ from mn_onnx.extract.blocks import Indices, index_dtype
 from mn_onnx.extract.edges import half_edge_heads, pair_half_edges
 from mn_onnx.extract.smooth.faces import mean_over_corners
 from mn_onnx.extract.surface import Surface
+from mn_onnx.ir.kernel import threaded_kernel
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -25,7 +25,7 @@ LONG = 0.5
 """Edges of at least this part of the longest one are halved; the two longest always are."""
 
 
-@numba.njit(cache=True, nogil=True)
+@threaded_kernel
 def _mark_spokes(
     vertices: Floats, offsets: Integers, corners: Indices, twins: Indices, chosen: Integers, halved: Booleans
 ) -> None:
@@ -52,7 +52,7 @@ def _mark_spokes(
                     halved[twins[corner]] = True
 
 
-@numba.njit(cache=True, nogil=True)
+@threaded_kernel
 def _count(offsets: Integers, spokes: Booleans, halved: Booleans, divided: Booleans) -> tuple[int, int]:
     """The numbers of polygons and corners of the divided surface."""
     polygons = total = 0
@@ -67,7 +67,7 @@ def _count(offsets: Integers, spokes: Booleans, halved: Booleans, divided: Boole
     return polygons, total
 
 
-@numba.njit(cache=True, nogil=True)
+@threaded_kernel
 def _fill(
     offsets: Integers,
     corners: Indices,

@@ -9,6 +9,8 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from mn_onnx.ir.kernel import threaded_kernel
+
 Floats = NDArray[np.float64]
 
 # pi / 2 in three parts (Cody and Waite, Software Manual for the Elementary Functions, chapter 8): the first two have 33
@@ -41,7 +43,7 @@ def erf(x: float) -> float:
     return math.erf(x)
 
 
-@numba.njit(cache=True, nogil=True)
+@threaded_kernel
 def _wave(x: Floats, quarters: float, result: Floats) -> None:
     """``sin(x + quarters * pi / 2)``, [n]. Without branches, so that the loop runs in vector registers."""
     for i in range(x.size):
