@@ -20,6 +20,7 @@ from mn_onnx.extract.schedule import Progress, TraversalStatistics, traverse
 from mn_onnx.extract.soup import PolygonSoup
 from mn_onnx.extract.surface import Surface
 from mn_onnx.extract.weld import weld
+from mn_onnx.ir.evaluate import evaluate
 from mn_onnx.ir.network import Network
 
 Floats = NDArray[np.float64]
@@ -61,7 +62,7 @@ class Extraction:
     """The level set of a network, and how it was found.
 
     ``statistics`` are those of the first traversal; ``seconds`` the time of each phase by name: traverse, weld, flat,
-    and perturb if that was needed.
+    and perturb if that was needed. ``coincidence``: vertices closer than this may be one point.
     """
 
     surface: Surface
@@ -69,6 +70,16 @@ class Extraction:
     degeneracy: Degeneracy
     flat_regions: FlatRegions
     seconds: dict[str, float]
+    coincidence: float
+
+    @property
+    def position_error(self) -> float | None:
+        """How far a coordinate may be from the true one because vertices were merged or taken back; None if none was.
+
+        Where a displacement is far larger than the perturbation, so are the rounding errors of its extrapolation.
+        """
+        merged = self.degeneracy.perturbation is not None or self.degeneracy.merged_vertices > 0
+        return self.coincidence if merged else None
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,7 +148,7 @@ def extract_surface(network: Network, lower: Floats, upper: Floats, **options: U
             surface, degeneracy = _in_the_limit(network, run, surface, degeneracy)
         with clock.phase("flat"):
             flat_regions = find_flat_regions(network, run.lower, run.upper, surface, threads=run.threads)
-    return Extraction(surface, statistics, degeneracy, flat_regions, clock.seconds)
+    return Extraction(surface, statistics, degeneracy, flat_regions, clock.seconds, run.coincidence)
 
 
 def _as_it_is(soup: PolygonSoup, broken_cuts: int, run: _Run) -> tuple[Surface, Degeneracy]:
@@ -153,8 +164,13 @@ def _as_it_is(soup: PolygonSoup, broken_cuts: int, run: _Run) -> tuple[Surface, 
 
 
 def _in_the_limit(network: Network, run: _Run, torn: Surface, degeneracy: Degeneracy) -> tuple[Surface, Degeneracy]:
-    """The surface under the first perturbation that closes it; if none does, that with the fewest unmatched edges."""
+    """The surface under the first perturbation that closes it and has its limit on the level set.
+
+    If there is none: the closed one nearest to the level set, or else that with the fewest unmatched edges.
+    """
     best = torn, degeneracy
+    # A torn mesh is better than one that a perturbation tears as much; any closed one is better than a doubtful one.
+    best_rank = bool(_torn(torn)), torn.unmatched.size, 0.0 if _torn(torn) else np.inf
     for attempt, size in enumerate(PERTURBATION_SIZES):
         candidate = _perturbed(network, run, size, attempt)
         if candidate is None:
@@ -162,11 +178,24 @@ def _in_the_limit(network: Network, run: _Run, torn: Surface, degeneracy: Degene
         surface, displacement = candidate
         tried = Degeneracy(degeneracy.found, size, displacement, attempts=attempt + 1)
         surface, tried = _cleaned(surface, run, run.coincidence, tried)
-        if not _torn(surface):
+        distance = _distance(network, surface)
+        is_torn = bool(_torn(surface))
+        if not is_torn and distance <= run.coincidence:
             return surface, tried
-        if surface.unmatched.size < best[0].unmatched.size:
-            best = surface, tried
+        rank = is_torn, surface.unmatched.size, distance
+        if rank < best_rank:
+            best, best_rank = (surface, tried), rank
     return best[0], replace(best[1], attempts=len(PERTURBATION_SIZES))
+
+
+def _distance(network: Network, surface: Surface) -> float:
+    """How far the vertices are from the level set at most, by |f| and the steepest slope.
+
+    Far above rounding where a perturbation exceeded a feature, so that no plane changes sides between its two scales
+    but one does on the way to none.
+    """
+    steepest = lengths(surface.gradients).max(initial=0.0)
+    return float(np.abs(evaluate(network, surface.vertices)).max(initial=0.0) / steepest) if steepest else 0.0
 
 
 def _whole_polygons(soup: PolygonSoup) -> tuple[PolygonSoup, int]:

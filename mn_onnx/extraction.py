@@ -63,7 +63,7 @@ def extract(
         invariants = check_invariants(surface, bounds=model.bounds)
         measurable = surface.n_polygons > 0 and invariants.area > 0
         if check and measurable:
-            residuals = measure_residuals(model, surface, run.runtime)
+            residuals = measure_residuals(model, surface, run.runtime, position_error=found.position_error)
     certificate, polish_entries, smooth_notes = dict[str, Any](NOT_CERTIFIED), None, list[str]()
     if not model.exact and measurable:
         with phases.phase("certify"):

@@ -6,8 +6,11 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+import onnx
 import pytest
+from onnx_models import model_of, node
 
+import mn_onnx
 from mn_onnx.extract import pipeline
 from mn_onnx.extract.invariants import check_invariants
 from mn_onnx.extract.pipeline import Extraction, extract_surface
@@ -158,6 +161,44 @@ def test_coincidences_up_to_rounding_are_exact(body: Body, volume: float, area: 
     assert invariants.volume == pytest.approx(volume, abs=1e-9)
     assert invariants.area == pytest.approx(area, abs=1e-9)
     assert invariants.euler == euler
+
+
+def dense(activations: list[list[onnx.NodeProto]], layers: list[tuple[Any, Any]]) -> onnx.ModelProto:
+    """Dense layers of ``(weights, biases)`` with ``activations`` between them: nodes from ``h`` to ``a``."""
+    nodes, constants = [], {}
+    for number, (weights, biases) in enumerate(layers):
+        names = [f"W{number}", f"b{number}"]
+        constants |= dict(zip(names, (np.array(weights, np.float32), np.array(biases, np.float32)), strict=True))
+        last = number == len(layers) - 1
+        nodes.append(node("Gemm", [f"a{number - 1}" if number else "x", *names], ["y" if last else f"h{number}"]))
+        for activation in [] if last else activations[number]:
+            copy = onnx.NodeProto()
+            copy.CopyFrom(activation)
+            copy.input[:] = [f"{name}{number}" for name in activation.input]
+            copy.output[:] = [f"{name}{number}" for name in activation.output]
+            nodes.append(copy)
+    return model_of(nodes, constants)
+
+
+def test_a_perturbation_above_a_feature_gives_way_to_a_smaller_one() -> None:
+    """0.2 in float32 puts a knot 2e-8 beside the face of the box: the largest perturbation moves it across."""
+    hard, absolute = node("HardSigmoid", ["h"], ["a"]), node("Abs", ["h"], ["a"])
+    first = [[-1, -1], [0, 1], [1, 1]], [0.25, 0]
+    second = [[-2, 0, 2, -4, 4, 2, 2], [0, -2, 4, 2, 0, 0, -4]], [0, 0, 0, 1, -1, 1, -1]
+    last = [[-1], [-1], [0], [1], [-0.5], [-0.5], [0.5]], [1]
+    model = mn_onnx.load(dense([[hard], [absolute]], [first, second, last]))
+    surface = mn_onnx.extract(model)
+    assert surface.report["degeneracy"]["perturbation"] < pipeline.PERTURBATION_SIZES[0]
+    assert np.abs(evaluate(model.network, surface.vertices)).max() < 1e-14
+
+
+def test_rounding_that_taking_vertices_back_amplifies_is_no_fault() -> None:
+    """A perturbation of 1e-9 moves a vertex by 7.7e-7, and so it does with rounding errors."""
+    first = [[-1, 0.5, 0], [1, 1, 0], [0.5, 1, -1]], [-0.25, 0, -0.25]
+    model = mn_onnx.load(dense([[node("LeakyRelu", ["h"], ["a"])]], [first, ([[-1], [1], [1]], [-0.75])]))
+    surface = mn_onnx.extract(model)  # CheckFailed before: 3 times what rounding of the vertices as they are explains
+    assert surface.report["degeneracy"]["displacement"] > 100 * surface.report["degeneracy"]["perturbation"]
+    assert np.abs(evaluate(model.network, surface.vertices)).max() < 1e-12
 
 
 def test_the_result_does_not_depend_on_threads() -> None:

@@ -62,7 +62,7 @@ def measure_residuals(
 ) -> Residuals:
     """Measure ``surface``, which must have an area.
 
-    ``position_error``: how far a stored coordinate may be from the true one (default: float64 rounding within the box).
+    ``position_error``: how far a coordinate may be from the true one (None: by float64 rounding within the box).
     ``most_vertices``: how many to measure at most, None for all. ``runtime``: the program to ask besides, or None.
     """
     vertices = np.flatnonzero(np.bincount(surface.corners))
