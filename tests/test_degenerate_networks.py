@@ -163,6 +163,31 @@ def test_coincidences_up_to_rounding_are_exact(body: Body, volume: float, area: 
     assert invariants.euler == euler
 
 
+def ridge(direction: tuple[float, float, float], shift: float, slope: float, ridges: int) -> Network:
+    """``f <= 0`` with creases at zero, on one plane or two: {f < 0} touches itself there from both sides."""
+
+    def body(sketch: Sketch[Any], x: Any) -> Any:
+        distance = sketch.abs(sketch.affine(x, [direction], [shift]))
+        if ridges == 2:
+            distance = sketch.abs(sketch.affine(distance, [[1.0]], [-0.4]))
+        return sketch.affine(distance, [[-slope]], [0.0])
+
+    return as_network(body)
+
+
+@pytest.mark.parametrize("ridges", [1, 2])
+@pytest.mark.parametrize("seed", range(12))
+def test_both_sheets_along_a_crease_on_the_level_are_there(seed: int, ridges: int) -> None:
+    """Rounding puts the crease on either side of the level: without care it has one sheet then, or none."""
+    generator = np.random.default_rng(seed)
+    direction = np.eye(3)[seed % 3] * (1.0, 2.7)[seed % 2] if seed % 4 else generator.normal(size=3)
+    network = ridge(tuple(direction), generator.uniform(-0.3, 0.3), generator.uniform(0.1, 3.0), ridges)
+    extraction = extract_surface(network, LOWER, UPPER, threads=1)
+    assert_well_formed(network, extraction)
+    assert extraction.surface.n_polygons == 2 * ridges
+    np.testing.assert_allclose(extraction.surface.gradients.sum(axis=0), 0.0, atol=1e-12)
+
+
 def dense(activations: list[list[onnx.NodeProto]], layers: list[tuple[Any, Any]]) -> onnx.ModelProto:
     """Dense layers of ``(weights, biases)`` with ``activations`` between them: nodes from ``h`` to ``a``."""
     nodes, constants = [], {}

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
@@ -20,7 +21,7 @@ from mn_onnx.ir.network import Network
 from oracle.integer_networks import IntegerNetwork
 from oracle.level_set import exact_level_set
 from oracle.random_networks import RandomNetwork
-from oracle.sketch import as_network
+from oracle.sketch import Sketch, as_network
 
 GENERIC = [
     (("relu", 6),),
@@ -76,6 +77,23 @@ def test_roots_match_the_oracle(network: Network) -> None:
     assert roots.problems() == []
     np.testing.assert_allclose(roots.positions, [position for position, _ in expected], atol=1e-12)
     np.testing.assert_allclose(roots.slopes, [slope for _, slope in expected], atol=1e-12)
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_where_f_touches_zero_it_rises_to_it_and_falls(seed: int) -> None:
+    """Two zeros of ``-slope | |a x + b| - 0.2 |``, each a root from either side, in places equal but for rounding."""
+    generator = np.random.default_rng(seed)
+    slope, scale, shift = generator.uniform(0.1, 3.0, 3)
+
+    def body(sketch: Sketch[Any], x: Any) -> Any:
+        distance = sketch.abs(sketch.affine(x, [[1 + scale]], [shift / 4]))
+        return sketch.affine(sketch.abs(sketch.affine(distance, [[1.0]], [-0.2])), [[-slope]], [0.0])
+
+    roots = extract_roots(as_network(body, 1), np.array([-1.5]), np.array([1.5]), threads=1).roots
+    assert roots.problems() == []
+    zeros = (np.array([-0.2, 0.2]) - shift / 4) / (1 + scale)
+    np.testing.assert_allclose(roots.positions, zeros.repeat(2), atol=1e-12)
+    assert (np.sign(roots.slopes) == [1, -1, 1, -1]).all()
 
 
 def test_a_square_is_one_polyline_around_its_inside() -> None:

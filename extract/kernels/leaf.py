@@ -12,6 +12,7 @@ import numpy as np
 from mn_onnx.extract.kernels.lanes import fma, lanes_of, load, splat, store
 from mn_onnx.extract.kernels.memory import (
     CELL_CAPACITY,
+    CELL_VERTICES,
     CHOICE,
     CHOICE_FIRST,
     CHOICE_LAST,
@@ -20,6 +21,7 @@ from mn_onnx.extract.kernels.memory import (
     OUT_VALUES,
     POLY_A,
     POLY_B,
+    POLY_VALUES,
     STATE_HIGH,
     STATE_LOW,
     SYS_COLS,
@@ -35,6 +37,7 @@ from mn_onnx.extract.kernels.memory import (
     weights_of,
 )
 from mn_onnx.extract.kernels.polytope import (
+    TINY,
     clip_polygon,
     count_corners_inside,
     evaluate_affine,
@@ -49,6 +52,8 @@ from mn_onnx.ir.kernel import kernel
 REMEMBERED = 2048
 # Corners of one vertex that are further from one another, relative to their coordinates, are left for `weld` to judge.
 APART = 2.0**-40
+# Values this small, relative to the extent of the box and the slope, may be zero but for rounding.
+ROUNDING = 1e-13
 
 
 @kernel
@@ -155,6 +160,16 @@ def substitute_output(F, N, X, M, system, floats, target):
 
 
 @kernel
+def count_small(X, values, count, rounding):
+    """How many of ``X[values : values + count]`` are not zero but may be, by rounding."""
+    small = 0
+    for v in range(values, values + count):
+        if TINY < abs(X[v]) <= rounding:
+            small += 1
+    return small
+
+
+@kernel
 def emit_choice(F, N, X, J, M, output, tables, slot_of_tag, cell, cell_rows, system, floats):
     """Emit the polygon of the chosen states, if the surface has one there.
 
@@ -166,6 +181,13 @@ def emit_choice(F, N, X, J, M, output, tables, slot_of_tag, cell, cell_rows, sys
     substitute_output(F, N, X, M, system, floats, gradient)
     evaluate_affine(F, N, X, M, cell, OUT_VALUES, X[gradient], X[gradient + 1], X[gradient + 2], X[gradient + 3])
     low, high = value_range(X, M, OUT_VALUES, N[cell + CELL_CAPACITY])
+    rounding = ROUNDING * tables.extent * (abs(X[gradient]) + abs(X[gradient + 1]) + abs(X[gradient + 2]))
+    if low > rounding or high < -rounding:
+        return 0
+    # If the surface may lie in a face of the cell, rounding would decide whether it is there, and in which piece.
+    one_sided = low >= -rounding or high <= rounding
+    if one_sided and count_small(X, OUT_VALUES * M, N[cell + CELL_VERTICES], rounding) >= 3:
+        return 1
     if low >= 0.0 or high < 0.0:
         return 0
     count = find_cut_edges(F, N, X, J, M, cell, cell_rows, OUT_VALUES)
@@ -190,10 +212,14 @@ def emit_choice(F, N, X, J, M, output, tables, slot_of_tag, cell, cell_rows, sys
             plane = knot + state - side
             constant = X[at + 3] - tables.knots[plane]
             inside = count_corners_inside(X, M, count, polygon, X[at], X[at + 1], X[at + 2], constant, side, gradient)
-            if inside == 0:
-                return 0
             if inside == count:
                 continue
+            # If all of the polygon may lie on the knot, rounding would decide which piece has it, if any.
+            rounding = ROUNDING * tables.extent * (abs(X[at]) + abs(X[at + 1]) + abs(X[at + 2]))
+            if abs(X[POLY_VALUES * M]) <= rounding and count_small(X, POLY_VALUES * M, count, rounding) == count:
+                return 1
+            if inside == 0:
+                return 0
             tag = 2 * plane + side
             count = clip_polygon(X, J, M, count, polygon, tags, other, other_tags, side, tag)
             polygon, tags, other, other_tags = other, other_tags, polygon, tags

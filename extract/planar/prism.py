@@ -17,6 +17,7 @@ from mn_onnx.extract.pipeline import Extraction, RunOptions, extract_surface
 from mn_onnx.extract.planar.curve import Curve, Roots
 from mn_onnx.extract.planar.embed import embed
 from mn_onnx.extract.surface import Surface
+from mn_onnx.ir.evaluate import evaluate
 from mn_onnx.ir.network import Network
 
 Floats = NDArray[np.float64]
@@ -74,10 +75,27 @@ def extract_roots(network: Network, lower: Floats, upper: Floats, **options: Unp
     slab = extract_surface(wide, low, high, **options)
     surface = _inside_the_box(slab)
     positions = surface.vertices[surface.corners[surface.offsets[:-1]], 0]
-    # Where f only touches zero from below it rises to it first, and falls then.
-    order = np.lexsort((-surface.gradients[:, 0], positions))
-    slopes, errors = surface.gradients[order, 0], surface.errors[order]
-    return RootExtraction(Roots(positions[order], slopes, errors, float(low[0]), float(high[0])), slab)
+    slopes = surface.gradients[:, 0]
+    is_below = bool(evaluate(network, lower[None])[0] < 0)
+    order = _alternating(positions, slopes, is_below, slab.coincidence)
+    roots = Roots(np.sort(positions), slopes[order], surface.errors[order], float(low[0]), float(high[0]))
+    return RootExtraction(roots, slab)
+
+
+def _alternating(positions: Floats, slopes: Floats, is_below: bool, apart: float) -> NDArray[np.int64]:
+    """The order of roots along the axis, which f crosses from below and from above by turns.
+
+    Of two roots not ``apart``, as where f only touches zero, rounding does not tell which is the first. ``is_below``:
+    whether f is negative before the first root.
+    """
+    order = np.argsort(positions, kind="stable")
+    for first in range(order.size - 1):
+        here, there = order[first : first + 2]
+        turned = (slopes[here] > 0) != is_below and (slopes[there] > 0) == is_below
+        if turned and positions[there] - positions[here] <= apart:
+            order[first], order[first + 1] = there, here
+        is_below = not slopes[order[first]] > 0
+    return order
 
 
 def _inside_the_box(extraction: Extraction) -> Surface:
