@@ -15,8 +15,8 @@ import mn_onnx.extract as _extract_package
 from mn_onnx.kernel_cache import drop_stale_kernels, ensure_place_for_kernels, user_cache
 
 if TYPE_CHECKING:
-    from mn_onnx.errors import CheckFailed, MnOnnxError, ModelRefused, Problem, UsageError
-    from mn_onnx.extract.files import read_mesh, write_mesh
+    from mn_onnx.errors import CheckFailed, MemoryLimitReached, MnOnnxError, ModelRefused, Problem, UsageError
+    from mn_onnx.extract.files import MeshFileError, read_mesh, write_mesh
     from mn_onnx.extract.surface import Surface
     from mn_onnx.extraction import extract
     from mn_onnx.model import Model, load
@@ -27,6 +27,8 @@ __version__ = "0.1.0"
 
 _HOMES = {
     "CheckFailed": "mn_onnx.errors",
+    "MemoryLimitReached": "mn_onnx.errors",
+    "MeshFileError": "mn_onnx.extract.files",
     "MnOnnxError": "mn_onnx.errors",
     "Model": "mn_onnx.model",
     "ModelRefused": "mn_onnx.errors",
@@ -43,6 +45,8 @@ _HOMES = {
 
 __all__ = [
     "CheckFailed",
+    "MemoryLimitReached",
+    "MeshFileError",
     "MnOnnxError",
     "Model",
     "ModelRefused",

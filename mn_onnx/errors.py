@@ -6,12 +6,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from mn_onnx.extract.errors import MnOnnxError
+
 if TYPE_CHECKING:
     from mn_onnx.extract.surface import Surface
 
 
-class MnOnnxError(Exception):
-    """Base of all errors that mn-onnx raises on purpose."""
+__all__ = ["CheckFailed", "MemoryLimitReached", "MnOnnxError", "ModelRefused", "Problem", "UsageError"]
 
 
 class UsageError(MnOnnxError):

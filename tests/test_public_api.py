@@ -24,6 +24,13 @@ def test_every_public_name_is_there() -> None:
         _ = mn_onnx.nothing_such
 
 
+def test_every_public_error_has_one_base() -> None:
+    public = (getattr(mn_onnx, name) for name in mn_onnx.__all__)
+    errors = [value for value in public if isinstance(value, type) and issubclass(value, Exception)]
+    assert len(errors) > 4
+    assert all(issubclass(error, mn_onnx.MnOnnxError) for error in errors)
+
+
 def test_importing_loads_no_heavy_package() -> None:
     code = (
         "import sys, mn_onnx, mn_onnx.cli; heavy = {'numpy', 'numba', 'onnx', 'onnxruntime', 'trimesh', 'rich'};"

@@ -10,12 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mn_onnx.extract.blocks import Indices
+from mn_onnx.extract.errors import MnOnnxError
 
 CHUNK = 1 << 17
 """Rows that are turned into bytes or text at a time."""
 
 
-class MeshFileError(Exception):
+class MeshFileError(MnOnnxError):
     """A mesh file cannot be written or read as asked."""
 
 
