@@ -43,13 +43,21 @@ def _apply(group: FunctionGroup, t: Floats, t_error: Floats, unit: float) -> tup
     if isinstance(function, SmoothFunction):
         _, total = running_error(function.expression, t, t_error, unit)
         _, local = running_error(function.expression, t, np.zeros_like(t), unit)
-        return value, slope, local, total
+        return value, slope, local + _change_of_slope(function, t, t_error, slope) * t_error, total
     # A product and a sum; and where a knot lies within the error of t, what another slope would change.
     steepness = function.steepness
     local = 3 * unit * (np.abs(value) + steepness * np.abs(t))
     total = steepness * t_error + local
     flattest, steepest = function.slopes_between(t - t_error, t + t_error)
     return value, slope, local + np.maximum(steepest - slope, slope - flattest) * t_error, total
+
+
+def _change_of_slope(function: SmoothFunction, t: Floats, t_error: Floats, slope: Floats) -> Floats:
+    """How much the slope differs within ``t_error`` of ``t``: at a knot, as of relu, all of it; 0 where undefined."""
+    with np.errstate(all="ignore"):
+        changes = [np.abs(function.slopes(t + side * t_error) - slope) for side in (-1.0, 1.0)]
+    change: Floats = np.fmax(*changes)
+    return np.where(np.isfinite(change), change, 0.0)
 
 
 def rounding_error_bound(

@@ -8,6 +8,7 @@ from hypothesis import given, settings
 from ir_networks import (
     PIECEWISE_LINEAR,
     RELU,
+    RELU_EXPRESSION,
     SILU,
     SMOOTH,
     STAIRS,
@@ -20,7 +21,8 @@ from ir_networks import (
 )  # fmt: skip
 
 from mn_onnx.ir.evaluate import evaluate, float32_error_bound, float64_error_bound, gradient
-from mn_onnx.ir.network import AffineRow, Network, Unit
+from mn_onnx.ir.expression import Expression
+from mn_onnx.ir.network import AffineRow, KnotTable, Network, Unit
 from mn_onnx.ir.passes import canonicalize
 
 
@@ -107,6 +109,18 @@ def test_rounding_errors_stay_below_their_bound(function, dtype, roundoff) -> No
     bound = float32_error_bound(network, points, unit_roundoff=roundoff)
     assert (error <= bound).all()
     assert bound.max() < 1000 * error.max(), "a bound that allows everything checks nothing"
+
+
+@pytest.mark.parametrize("relu", [RELU, RELU_EXPRESSION])
+def test_a_knot_within_the_rounding_of_a_pre_activation_is_allowed_for(relu: KnotTable | Expression) -> None:
+    """``relu(0.1 x + 0.2 y - 0.3 z)`` near zero: in floating point it may be positive where it is zero."""
+    unit = Unit(AffineRow(np.arange(3), np.array([0.1, 0.2, -0.3]), 0.0), (relu,), "relu")
+    network = Network(3, (unit,), AffineRow(np.array([3]), np.ones(1), 0.0))
+    points = np.array([[1.0, 1.0, 1.0 + 2.0**-30], [1.0, 1.0, 1.1]])
+    assert not evaluate(network, points).any()
+    near, far = float32_error_bound(network, points)
+    assert 2.0**-24 * 0.1 < near < 1e-5
+    assert far < 0.1 * near
 
 
 def test_float64_bound_is_small_and_covers_the_order_of_summation() -> None:
