@@ -25,8 +25,8 @@ from mn_onnx.ir.network import Network
 
 Floats = NDArray[np.float64]
 
-PERTURBATION_SIZES = (1e-9, 1e-10, 1e-11, 1e-8)
-"""Tried in this order: above the rounding of the traversal's bounds (about 1e-12), below the features of a network."""
+PERTURBATION_SIZES = (1e-9, 1e-10, 1e-11, 1e-12, 1e-8)
+"""Tried in this order: above the rounding of the traversal (about 1e-13), below the features of a network."""
 
 COINCIDENCE = 1e-12
 """Vertices closer than this, relative to the box, may be one point: above rounding, below a perturbation's size."""
