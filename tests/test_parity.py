@@ -9,11 +9,13 @@ import onnx
 import pytest
 from numpy.typing import NDArray
 from onnx import TensorProto, helper
+from onnx_models import model_of
 from small_models import octahedron_model
 
 import mn_onnx
 from mn_onnx.checks.parity import check_parity, coarsest_rounding, probe_points
 from mn_onnx.checks.runtime import BATCH, Runtime
+from mn_onnx.ir.evaluate import float32_error_bound
 
 Floats = NDArray[np.float64]
 
@@ -54,6 +56,22 @@ def test_an_error_in_batches_of_some_size_is_found(model: mn_onnx.Model, largest
     (problem,) = check_parity(model, runtime).problems()
     assert "differs from a faulty program" in problem
     assert check_parity(model, cast(Runtime, Faulty(model, 0, error))).problems() == []
+
+
+def test_rounding_of_constants_that_cancel_is_allowed_for() -> None:
+    """``(1 - 2 |x|) - 1`` is off by half a unit in the last place of 1, however small ``x`` is."""
+    nodes = [
+        helper.make_node("Abs", ["x"], ["a"]),
+        helper.make_node("Gemm", ["a", "W", "one"], ["g"]),
+        helper.make_node("Sub", ["g", "one"], ["y"]),
+    ]
+    constants = {"W": np.array([[-2.0]], np.float32), "one": np.ones(1, np.float32)}
+    model = mn_onnx.load(model_of(nodes, constants, inputs={"x": ("N", 1)}))
+    runtime = Runtime(model.read, model.imported.layout)
+    points = probe_points(model)
+    difference = np.abs(runtime.evaluate(points) - model.evaluate(points))
+    assert (difference > float32_error_bound(model.imported.network, points)).any()
+    assert check_parity(model, runtime).problems() == []
 
 
 def test_the_coarsest_number_format_decides() -> None:
