@@ -31,6 +31,9 @@ PERTURBATION_SIZES = (1e-9, 1e-10, 1e-11, 1e-12, 1e-8)
 COINCIDENCE = 1e-12
 """Vertices closer than this, relative to the box, may be one point: above rounding, below a perturbation's size."""
 
+ROUNDINGS = 16 * float(np.finfo(np.float64).eps)
+"""By how much rounding may shift a plane, relative to the magnitudes that a perturbation's size is relative to."""
+
 SHALLOW = 1e-12
 """A gradient this small, relative to the largest one, may be zero but for rounding."""
 
@@ -76,10 +79,12 @@ class Extraction:
     def position_error(self) -> float | None:
         """How far a coordinate may be from the true one because vertices were merged or taken back; None if none was.
 
-        Where a displacement is far larger than the perturbation, so are the rounding errors of its extrapolation.
+        What moves vertices much further than the perturbation moves planes does the same with rounding errors.
         """
-        merged = self.degeneracy.perturbation is not None or self.degeneracy.merged_vertices > 0
-        return self.coincidence if merged else None
+        size = self.degeneracy.perturbation
+        if size is None:
+            return self.coincidence if self.degeneracy.merged_vertices else None
+        return self.coincidence + ROUNDINGS / size * self.degeneracy.displacement
 
 
 @dataclass(frozen=True, eq=False)
