@@ -97,8 +97,10 @@ def _crossing_densities(evaluator: Evaluator, points: Floats, normals: Floats, w
     families = _line_families(evaluator, points, normals, window)
     if points.shape[1] == 2:
         return np.asarray(np.sqrt((families**2).sum(axis=2)).sum(axis=1))
-    densities = np.empty(len(points))
+    densities = np.zeros(len(points))
     for index, (family, normal) in enumerate(zip(families, normals, strict=True)):
+        if not normal.any():  # found on a line across a place where f is constant
+            continue
         first = np.cross(normal, np.eye(3)[int(np.argmin(np.abs(normal)))])
         first /= np.sqrt(first @ first)
         x, y = family @ first, family @ np.cross(normal, first)

@@ -53,6 +53,14 @@ def test_forecast_is_near_the_count(function: Expression | KnotTable, knots: flo
     assert expected.area == pytest.approx(surface.area, rel=0.1)
 
 
+def test_a_gradient_that_vanishes_at_a_crossing_is_no_obstacle() -> None:
+    """``max(x, 0) + min(x + 1/2, 0)`` has its zeros on ``[-1/2, 0]``, where it is constant."""
+    table = KnotTable.exact([-0.5, 0.0], [[1.0, 0.0, 1.0]], [[0.5, 0.0, 0.0]])
+    units = tuple(Unit(AffineRow(np.arange(3), row, 0.0), (table,), "clip", table) for row in np.eye(3))
+    found = forecast(Network(3, units, AffineRow(np.arange(3, 6), np.ones(3), 0.0)), LOW, HIGH)
+    assert np.isfinite(found.pieces)
+
+
 def test_finer_surrogates_have_gradients_closer_to_the_true_ones() -> None:
     network = dense([12, 8], SINE, seed=4)
     angles = []

@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from ir_networks import RELU, SILU, SINE
 
 from mn_onnx.extract.kernels.patches import Relaxed, Tables, find_interval, relax_level
+from mn_onnx.ir.expression import T, apply, constant
 from mn_onnx.ir.network import KnotTable, ScalarFunction
 from mn_onnx.ir.scalar import evaluate
 from mn_onnx.ir.surrogate.close_table import close_table
@@ -38,6 +39,12 @@ def tables_of(function: ScalarFunction) -> Tables:
         table.intercepts[0],
         table.errors[0],
     )
+
+
+def test_a_constant_stands_for_itself() -> None:
+    """Its proved error is the smallest number there is; the tolerance, a thousandth of it, would be none at all."""
+    function = apply("maximum", apply("subtract", apply("sigmoid", T), constant(2.0)), constant(0.0))
+    assert tables_of(function).errors.max() < 1e-300
 
 
 def test_rounding_of_a_knot_is_no_slope() -> None:

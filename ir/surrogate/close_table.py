@@ -21,7 +21,8 @@ def close_table(function: ScalarFunction, table: KnotTable, output: int, lower: 
     own = slice(output, output + 1)
     itself = KnotTable(table.knots, table.slopes[own], table.intercepts[own], table.errors[own])
     error = float(itself.errors.max(initial=0.0))
-    if not isinstance(function, Expression) or error == 0.0 or not upper > lower:
+    # A constant's error is the smallest number there is, of which there is no part.
+    if not isinstance(function, Expression) or error / FINENESS == 0.0 or not upper > lower:
         return itself
     try:
         closer = fit((function,), lower, upper, (error / FINENESS,), most_excess=2.0)
