@@ -183,7 +183,7 @@ def _in_the_limit(network: Network, run: _Run, torn: Surface, degeneracy: Degene
         surface, displacement = candidate
         tried = Degeneracy(degeneracy.found, size, displacement, attempts=attempt + 1)
         surface, tried = _cleaned(surface, run, run.coincidence, tried)
-        distance = _distance(network, surface)
+        distance = _distance(network, run, surface)
         is_torn = bool(_torn(surface))
         if not is_torn and distance <= run.coincidence:
             return surface, tried
@@ -193,14 +193,18 @@ def _in_the_limit(network: Network, run: _Run, torn: Surface, degeneracy: Degene
     return best[0], replace(best[1], attempts=len(PERTURBATION_SIZES))
 
 
-def _distance(network: Network, surface: Surface) -> float:
-    """How far the vertices are from the level set at most, by |f| and the steepest slope.
+def _distance(network: Network, run: _Run, surface: Surface) -> float:
+    """How far the vertices are from the level set in the box at most: by |f| and the steepest slope, and outside it.
 
     Far above rounding where a perturbation exceeded a feature, so that no plane changes sides between its two scales
     but one does on the way to none.
     """
-    steepest = lengths(surface.gradients).max(initial=0.0)
-    return float(np.abs(evaluate(network, surface.vertices)).max(initial=0.0) / steepest) if steepest else 0.0
+    if not surface.n_polygons:
+        return 0.0
+    vertices = surface.vertices
+    steepest = max(lengths(surface.gradients).max(), np.finfo(np.float64).tiny)
+    from_level = np.abs(evaluate(network, vertices)).max() / steepest
+    return float(max(from_level, (run.lower - vertices).max(), (vertices - run.upper).max()))
 
 
 def _whole_polygons(soup: PolygonSoup) -> tuple[PolygonSoup, int]:

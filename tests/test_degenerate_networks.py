@@ -205,16 +205,45 @@ def dense(activations: list[list[onnx.NodeProto]], layers: list[tuple[Any, Any]]
     return model_of(nodes, constants)
 
 
-def test_a_perturbation_above_a_feature_gives_way_to_a_smaller_one() -> None:
-    """0.2 in float32 puts a knot 2e-8 beside the face of the box: the largest perturbation moves it across."""
-    hard, absolute = node("HardSigmoid", ["h"], ["a"]), node("Abs", ["h"], ["a"])
-    first = [[-1, -1], [0, 1], [1, 1]], [0.25, 0]
-    second = [[-2, 0, 2, -4, 4, 2, 2], [0, -2, 4, 2, 0, 0, -4]], [0, 0, 0, 1, -1, 1, -1]
-    last = [[-1], [-1], [0], [1], [-0.5], [-0.5], [0.5]], [1]
-    model = mn_onnx.load(dense([[hard], [absolute]], [first, second, last]))
-    surface = mn_onnx.extract(model)
+HARD_SIGMOID, ABS = node("HardSigmoid", ["h"], ["a"]), node("Abs", ["h"], ["a"])
+
+
+@pytest.mark.parametrize(
+    ("model", "level"),
+    [
+        (
+            dense(
+                [[HARD_SIGMOID], [ABS]],
+                [
+                    ([[-1, -1], [0, 1], [1, 1]], [0.25, 0]),
+                    ([[-2, 0, 2, -4, 4, 2, 2], [0, -2, 4, 2, 0, 0, -4]], [0, 0, 0, 1, -1, 1, -1]),
+                    ([[-1], [-1], [0], [1], [-0.5], [-0.5], [0.5]], [1]),
+                ],
+            ),
+            0.0,
+        ),
+        (
+            dense(
+                [[HARD_SIGMOID]],
+                [
+                    (
+                        [[-0.5, 0.5, 0, 1, 0.5, 0], [0.5, -1, -0.5, 1, -1, 0], [0, -1, 0, 0, 0, 0]],
+                        [-0.5, 0, -0.25, -0.5, 0.5, 0.5],
+                    ),
+                    ([[-1], [-0.5], [-0.5], [1], [1], [-1]], [0.5]),
+                ],
+            ),
+            0.22500000707805157,
+        ),
+    ],
+)
+def test_a_perturbation_above_a_feature_gives_way_to_a_smaller_one(model: onnx.ModelProto, level: float) -> None:
+    """0.2 in float32 puts knots 2e-8 beside faces of the box: the largest perturbation moves them across."""
+    loaded = mn_onnx.load(model, level=level)
+    surface = mn_onnx.extract(loaded)
     assert surface.report["degeneracy"]["perturbation"] < pipeline.PERTURBATION_SIZES[0]
-    assert np.abs(evaluate(model.network, surface.vertices)).max() < 1e-14
+    assert np.abs(evaluate(loaded.network, surface.vertices)).max() < 1e-14
+    assert np.abs(surface.vertices).max() < 1 + 1e-12
 
 
 def test_rounding_that_taking_vertices_back_amplifies_is_no_fault() -> None:

@@ -60,6 +60,12 @@ class Parity:
         """A sentence if the comparison failed, else nothing."""
         if self.worst_ratio <= 1:
             return []
+        if np.isinf(self.max_abs_err):
+            return [
+                f"{self.runtime} has values that are infinite or not numbers where the imported network, in float64, "
+                "has none: the model's arithmetic overflows in the box (try smaller --bounds), or uses an operator in "
+                "a way that is read wrongly"
+            ]
         return [
             f"the imported network differs from {self.runtime} by {self.max_abs_err:.3g}, {self.worst_ratio:.3g} times "
             "what rounding explains: the model uses an operator in a way that is read wrongly, or its value at a point "
