@@ -77,14 +77,12 @@ class Extraction:
 
     @property
     def position_error(self) -> float | None:
-        """How far a coordinate may be from the true one because vertices were merged or taken back; None if none was.
+        """How far a coordinate may be from the true one because vertices were taken back; None if they were not.
 
         What moves vertices much further than the perturbation moves planes does the same with rounding errors.
         """
         size = self.degeneracy.perturbation
-        if size is None:
-            return self.coincidence if self.degeneracy.merged_vertices else None
-        return self.coincidence + ROUNDINGS / size * self.degeneracy.displacement
+        return None if size is None else self.coincidence + ROUNDINGS / size * self.degeneracy.displacement
 
 
 @dataclass(frozen=True, eq=False)

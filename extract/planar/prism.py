@@ -76,7 +76,7 @@ def extract_roots(network: Network, lower: Floats, upper: Floats, **options: Unp
     surface = _inside_the_box(slab)
     positions = surface.vertices[surface.corners[surface.offsets[:-1]], 0]
     slopes = surface.gradients[:, 0]
-    is_below = bool(evaluate(network, lower[None])[0] < 0)
+    is_below = bool(evaluate(network, low[None, :1])[0] < 0)
     order = _alternating(positions, slopes, is_below, slab.coincidence)
     roots = Roots(np.sort(positions), slopes[order], surface.errors[order], float(low[0]), float(high[0]))
     return RootExtraction(roots, slab)
