@@ -66,7 +66,8 @@ def _with_errors(
     slopes = np.sqrt((surface.gradients**2).sum(axis=1))
     errors = np.minimum(errors, most + PLACED * side * slopes)
     steep = slopes > SHALLOW * np.median(slopes)
-    displacement = errors / np.maximum(slopes, np.finfo(np.float64).tiny)
+    with np.errstate(over="ignore"):  # infinite on a flat polygon
+        displacement = errors / np.maximum(slopes, np.finfo(np.float64).tiny)
     attributes = {**surface.attributes, "eps": errors, "displacement": displacement}
     return replace(surface, errors=errors, attributes=attributes), {
         "surface_eps": float(errors.max()),

@@ -80,6 +80,8 @@ def as_text(description: dict[str, Any]) -> str:
         f"  field        {description['output']!r} over {description['dimension']} coordinates",
         f"  extraction   {fidelity}",
     ]
+    if description["heads"]:
+        lines.append(f"  heads        {', '.join(description['heads'])}, inverted at the level: f is the value before")
     if description["forecast_polygons"] is not None:
         knots = description["knots_per_period"]
         fineness = "" if knots is None else f" at {knots:.3g} knots per period"

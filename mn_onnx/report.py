@@ -4,9 +4,12 @@ Its keys:
 
 - ``model``, ``model_sha256``, ``output``, ``level``, ``bounds``, ``threads``, ``versions``: what was extracted by what;
 - ``sign``: positive-outside or positive-inside; ``bounds_from``: option, metadata or default;
+- ``heads``: the monotone functions at the output's end that were inverted at the level, the outermost first: f, f_true
+  and their errors are the values before them, and only ``true_max_abs_f``, ``true_mean_abs_f``, ``ort_mean_abs_f`` and
+  the comparison with onnxruntime are about the output itself;
 - ``exact``, and ``surrogate_eps``: a proved bound on |f_true - f| in the box, zero for exact networks;
 - ``knots_per_period`` and ``forecast_polygons`` of the surrogates, null for exact networks;
-- ``surface_eps``, ``surface_eps_median``: proved bounds of |f_true - level| on the polygons; ``displacement``,
+- ``surface_eps``, ``surface_eps_median``: proved bounds of |f_true| on the polygons; ``displacement``,
   ``displacement_median``: that over the slope, how far the true level set may be to first order, where the slope is at
   least a tenth of the median one (``shallow_polygons`` are the others); ``vague_polygons``: those with a displacement
   bound above a twentieth of the box, which says nothing; ``gradient_angle_median``, in degrees: between the gradients
@@ -56,6 +59,7 @@ def model_entries(model: Model) -> dict[str, Any]:
         "output": model.imported.network.output_name,
         "level": model.level,
         "bounds": model.bounds.tolist(),
+        "heads": list(model.canonical.heads),
         "exact": model.exact,
         "sign": model.sign,
         "bounds_from": model.bounds_from,

@@ -56,7 +56,7 @@ def planar_summary(path: str, report: dict[str, Any]) -> str:
         )
     lines = [f"{path}: {what}; max |f| {report['max_abs_f']:.2g}", f"  box: {box_text(report)}"]
     if not report["exact"]:
-        lines.append(f"  surrogates within {report['surrogate_eps']:.2g} of the true network")
+        lines.append(_surrogate_bound(report))
     return "\n".join(lines)
 
 
@@ -67,10 +67,15 @@ def _closure(report: dict[str, Any]) -> str:
 
 
 def _surrogate_line(report: dict[str, Any]) -> str:
-    line = f"  surrogates within {report['surrogate_eps']:.2g} of the true network"
+    line = _surrogate_bound(report)
     if report["true_mean_abs_f"] is None:
         return line
-    return f"{line}, whose |f - level| on the mesh is {report['true_mean_abs_f']:.2g} in the mean"
+    return f"{line}; |output - level| on the mesh is {report['true_mean_abs_f']:.2g} in the mean"
+
+
+def _surrogate_bound(report: dict[str, Any]) -> str:
+    before = f" before {report['heads'][-1]}" if report["heads"] else ""
+    return f"  surrogates within {report['surrogate_eps']:.2g} of the true network{before}"
 
 
 def _certificate(entries: dict[str, Any]) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -41,6 +42,22 @@ def test_the_box_of_the_metadata_is_told(tmp_path: Path, capsys: pytest.CaptureF
     assert main(["inspect", *options]) == 0
     assert main(["extract", *options, "-o", str(tmp_path / "mesh.ply")]) == 0
     assert capsys.readouterr().out.count("[-1.5, 1.5] x [-1.5, 1.5] x [-1.5, 1.5], from the model's metadata") == 2
+
+
+def test_heads_are_told_beside_the_errors_before_them(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """After Exp, errors of the output are larger than those that are proved, which are of what goes into it."""
+    model = soft_octahedron_model(scale=3.0)
+    model.graph.node.append(node("Exp", ["y"], ["grown"], name="head"))
+    model.graph.output[0].name = "grown"
+    onnx.save(model, tmp_path / "model.onnx")
+    options = [str(tmp_path / "model.onnx"), "--bind", "code=0", "--knots-per-period", "2", "--level", "20"]
+    assert main(["inspect", *options]) == 0
+    assert "heads        head[0], inverted at the level" in capsys.readouterr().out
+    assert main(["extract", *options, "-o", str(tmp_path / "mesh.ply"), "--report", str(tmp_path / "report")]) == 0
+    assert "of the true network before head[0]; |output - level|" in capsys.readouterr().out
+    report = json.loads((tmp_path / "report").read_text())
+    assert report["heads"] == ["head[0]"]
+    assert report["true_max_abs_f"] > report["surrogate_eps"]
 
 
 def sinc_model(*, guarded: bool = False, softened: bool = False) -> onnx.ModelProto:

@@ -127,6 +127,7 @@ def test_stacked_heads_are_stripped_one_after_the_other() -> None:
     inner = dense([10], seed=1)
     network = over(over(inner, TANH, -3.0, 0.2), apply("sigmoid", T))
     result = canonical(network, level=0.6)
+    assert result.heads == tuple(unit.name for unit in reversed(network.units[-2:]))
     assert result.sign == -1
     assert len(result.network.units) == 10
     points = random_points(network, 300)
@@ -153,6 +154,7 @@ def test_clip_at_its_own_bound_and_other_heads_stay() -> None:
     for function, level in ((CLIP, 0.5), (KnotTable.exact([0.0], [[-1.0, 1.0]], [[0.0, 0.0]]), 0.25), (SINE, 0.1)):
         result = canonical(over(inner, function), level=level)
         assert not result.empty_reason
+        assert not result.heads
         assert len(result.network.units) == 11
 
 

@@ -57,7 +57,9 @@ class Canonical:
     ``network``: canonical; its level set 0 is that set, and it increases where ``source`` does. ``source``: the
     imported network. ``level``: the level asked for. ``lower``, ``upper``: the box, float64 [input_dim]; surrogates and
     their errors hold inside. ``sign``: -1 if ``network`` is the negated pre-activation of a decreasing head, else 1.
-    ``empty_reason``: why the level set is known to be empty, else "". ``steps``: the passes that ran.
+    ``heads``: names of the units whose monotone functions were inverted at the level, the outermost first: ``network``
+    gives the pre-activation of the last of them. ``empty_reason``: why the level set is known to be empty, else "".
+    ``steps``: the passes that ran.
     ``refined``: the proof that refinement ended with, None if no tolerance was asked for.
     """
 
@@ -67,6 +69,7 @@ class Canonical:
     lower: Floats
     upper: Floats
     sign: int
+    heads: tuple[str, ...]
     empty_reason: str
     steps: tuple[Step, ...]
     refined: Certificate | None = None
@@ -158,6 +161,7 @@ def canonicalize(
         lower,
         upper,
         program.sign,
+        program.heads,
         program.empty_reason,
         (*lowering_steps, *table_steps),
         refined,

@@ -14,9 +14,10 @@ from mn_onnx.ir.spec import Property
 class Program:
     """A network on its way to canonical form: the set ``{x in box | network(x) = level}``.
 
-    ``lower``, ``upper``: the box, float64 [input_dim]. ``sign``: -1 if
-    the output of ``network`` is the negated pre-activation of a decreasing head, else 1; ``network`` increases where
-    the original does. ``empty_reason``: why the level set is known to be empty, "" if it is not known to be.
+    ``lower``, ``upper``: the box, float64 [input_dim]. ``sign``: -1 if the output of ``network`` is the negated
+    pre-activation of a decreasing head, else 1; ``network`` increases where the original does. ``heads``: names of the
+    units whose functions were inverted at the level, the outermost first. ``empty_reason``: why the level set is known
+    to be empty, "" if it is not known to be.
     ``knots_per_period``: how finely surrogates follow smooth functions.
     ``tolerances``: instead, the sup errors wanted of the functions of a surrogate group, where given.
     """
@@ -26,6 +27,7 @@ class Program:
     upper: Floats
     level: float = 0.0
     sign: int = 1
+    heads: tuple[str, ...] = ()
     empty_reason: str = ""
     knots_per_period: float = 16.0
     tolerances: Mapping[Any, tuple[float, ...]] = field(default_factory=dict)

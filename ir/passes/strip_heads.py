@@ -62,7 +62,13 @@ def _strip(program: Program) -> Program | None:
     sign = inverse.direction * (1 if weight > 0 else -1)
     output = AffineRow(unit.row.columns, sign * unit.row.weights, sign * unit.row.bias)
     network = replace(program.network, output=output)
-    return replace(program, network=network, level=sign * inverse.argument, sign=sign * program.sign)
+    return replace(
+        program,
+        network=network,
+        level=sign * inverse.argument,
+        sign=sign * program.sign,
+        heads=(*program.heads, unit.name),
+    )
 
 
 def _run(program: Program) -> tuple[Program, bool]:
