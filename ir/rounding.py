@@ -29,27 +29,33 @@ def _row_rounding(values: Floats, weights: Floats, bias: Floats, unit: float) ->
 
 @dataclass(eq=False)
 class _Level:
-    """A level at a chunk of points: slopes and local errors of its outputs [n, o], rounding of its rows [n, u]."""
+    """A level at a chunk of points: slopes and local errors of its outputs [n, o], rounding of its rows [n, u].
+
+    ``bends``: [n, o], what changes of slope within the error of a pre-activation add.
+    """
 
     slopes: Floats
     local: Floats
+    bends: Floats
     rounding: Floats
 
 
-def _apply(group: FunctionGroup, t: Floats, t_error: Floats, unit: float) -> tuple[Floats, Floats, Floats, Floats]:
-    """(values, slopes, local errors, total errors) of a function at ``t`` known up to ``t_error``."""
+def _apply(
+    group: FunctionGroup, t: Floats, t_error: Floats, unit: float
+) -> tuple[Floats, Floats, Floats, Floats, Floats]:
+    """(values, slopes, local errors, bends, total errors) of a function at ``t`` known up to ``t_error``."""
     function = group.function
     value, slope = function.values(t), function.slopes(t)
     if isinstance(function, SmoothFunction):
         _, total = running_error(function.expression, t, t_error, unit)
         _, local = running_error(function.expression, t, np.zeros_like(t), unit)
-        return value, slope, local + _change_of_slope(function, t, t_error, slope) * t_error, total
+        return value, slope, local, _change_of_slope(function, t, t_error, slope) * t_error, total
     # A product and a sum; and where a knot lies within the error of t, what another slope would change.
     steepness = function.steepness
     local = 3 * unit * (np.abs(value) + steepness * np.abs(t))
     total = steepness * t_error + local
     flattest, steepest = function.slopes_between(t - t_error, t + t_error)
-    return value, slope, local + np.maximum(steepest - slope, slope - flattest) * t_error, total
+    return value, slope, local, np.maximum(steepest - slope, slope - flattest) * t_error, total
 
 
 def _change_of_slope(function: SmoothFunction, t: Floats, t_error: Floats, slope: Floats) -> Floats:
@@ -71,15 +77,26 @@ def rounding_error_bound(
     with the derivative of the output by it: ``sum |df/dt| rounding``, to first order where functions are smooth.
     ``true_functions``: analyse the units' true functions rather than their tables.
     """
+    return rounding_error_bounds(network, points, unit_roundoff=unit_roundoff, true_functions=true_functions)[1]
+
+
+def rounding_error_bounds(
+    network: Network, points: Floats, *, unit_roundoff: float, true_functions: bool = True
+) -> tuple[Floats, Floats]:
+    """Two bounds, float64 [n] each: where no slope changes within the error of a pre-activation, and anywhere.
+
+    The second is `rounding_error_bound`. In deep networks it says little: forward errors grow with every level, in the
+    worst case, until there is a knot within them at every point. The first holds nearly everywhere.
+    """
     points = validated_points(network, points)
     evaluator = Evaluator(network, true_functions=true_functions)
-    result = np.empty(points.shape[0])
+    smooth, anywhere = np.empty(points.shape[0]), np.empty(points.shape[0])
     for chunk in evaluator.chunks(points):
-        result[chunk] = _chunk_bound(evaluator, points[chunk], unit_roundoff)
-    return result
+        smooth[chunk], anywhere[chunk] = _chunk_bounds(evaluator, points[chunk], unit_roundoff)
+    return smooth, anywhere
 
 
-def _chunk_bound(evaluator: Evaluator, points: Floats, unit: float) -> Floats:
+def _chunk_bounds(evaluator: Evaluator, points: Floats, unit: float) -> tuple[Floats, Floats]:
     network = evaluator.network
     values = np.empty((points.shape[0], network.n_variables))
     values[:, : network.input_dim] = points
@@ -91,26 +108,29 @@ def _chunk_bound(evaluator: Evaluator, points: Floats, unit: float) -> Floats:
         t = below @ block.weights.T + block.bias
         rounding = _row_rounding(below, block.weights, block.bias, unit)
         t_error = errors[:, columns] @ np.abs(block.weights).T + rounding
-        level = _Level(np.empty((t.shape[0], block.outputs.size)), np.empty((t.shape[0], block.outputs.size)), rounding)
+        slopes, local, bends = np.empty((3, t.shape[0], block.outputs.size))
+        level = _Level(slopes, local, bends, rounding)
         for group in groups:
             place = contiguous(np.searchsorted(block.outputs, np.arange(network.n_variables)[group.outputs]))
             at = group.positions
-            values[:, group.outputs], level.slopes[:, place], level.local[:, place], errors[:, group.outputs] = _apply(
-                group, t[:, at], t_error[:, at], unit
-            )
+            applied = _apply(group, t[:, at], t_error[:, at], unit)
+            values[:, group.outputs], slopes[:, place], local[:, place], bends[:, place] = applied[:4]
+            errors[:, group.outputs] = applied[4]
         levels.append(level)
     row = network.output
     weights = row.weights[None, :]
-    total = _row_rounding(values[:, contiguous(row.columns)], weights, np.array([row.bias]), unit)[:, 0]
+    smooth = _row_rounding(values[:, contiguous(row.columns)], weights, np.array([row.bias]), unit)[:, 0]
+    bent = np.zeros_like(smooth)
     adjoint = np.zeros_like(values)
     adjoint[:, row.columns] = weights
     for (block, _), level in zip(reversed(evaluator.levels), reversed(levels), strict=True):
         of_outputs = adjoint[:, contiguous(block.outputs)]
-        total += (np.abs(of_outputs) * level.local).sum(axis=1)
+        smooth += (np.abs(of_outputs) * level.local).sum(axis=1)
+        bent += (np.abs(of_outputs) * level.bends).sum(axis=1)
         of_units = block.sum_outputs(of_outputs * level.slopes)
-        total += (np.abs(of_units) * level.rounding).sum(axis=1)
+        smooth += (np.abs(of_units) * level.rounding).sum(axis=1)
         adjoint[:, contiguous(block.columns)] += of_units @ block.weights
-    return total
+    return smooth, smooth + bent
 
 
 def float32_error_bound(network: Network, points: Floats, *, unit_roundoff: float = SINGLE) -> Floats:

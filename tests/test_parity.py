@@ -9,7 +9,7 @@ import onnx
 import pytest
 from numpy.typing import NDArray
 from onnx import TensorProto, helper
-from onnx_models import model_of
+from onnx_models import float32, model_of, node
 from small_models import octahedron_model
 
 import mn_onnx
@@ -56,6 +56,25 @@ def test_an_error_in_batches_of_some_size_is_found(model: mn_onnx.Model, largest
     (problem,) = check_parity(model, runtime).problems()
     assert ("a faulty program has values" if np.isnan(error) else "differs from a faulty program") in problem
     assert check_parity(model, cast(Runtime, Faulty(model, 0, error))).problems() == []
+
+
+def test_a_wrong_deep_network_is_found_though_knots_might_explain_it() -> None:
+    """Forward errors grow with every level: in the worst case there is a knot within them at every point."""
+    nodes, constants, last = [], {}, "x"
+    for level in range(8):
+        width = 3 if level == 0 else 64
+        constants[f"W{level}"] = float32(width, 64, seed=level) * np.float32(np.sqrt(2 / width))
+        nodes += [node("MatMul", [last, f"W{level}"], [f"t{level}"]), node("Relu", [f"t{level}"], [f"a{level}"])]
+        last = f"a{level}"
+    constants["O"] = float32(64, 1)
+    model = mn_onnx.load(model_of([*nodes, node("MatMul", [last, "O"], ["y"])], constants))
+    right = check_parity(model, Runtime(model.read, model.imported.layout))
+    assert right.problems() == []
+    assert right.unexplained_share == 0
+    size = float(np.median(np.abs(model.evaluate(probe_points(model)))))
+    wrong = check_parity(model, cast(Runtime, Faulty(model, BATCH, 0.01 * size)))
+    assert wrong.worst_ratio < 1
+    assert "differs from a faulty program" in wrong.problems()[0]
 
 
 def test_rounding_of_constants_that_cancel_is_allowed_for() -> None:

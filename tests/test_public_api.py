@@ -124,7 +124,7 @@ def test_a_network_that_was_read_wrongly_fails_the_check(monkeypatch: pytest.Mon
 
     true = Model.evaluate
     monkeypatch.setattr(Model, "evaluate", lambda self, points: true(self, points) * (1 + 1e-4))
-    with pytest.raises(mn_onnx.CheckFailed, match="times what rounding explains"):
+    with pytest.raises(mn_onnx.CheckFailed, match="more than rounding explains"):
         mn_onnx.extract(octahedron_model())
 
 
