@@ -76,7 +76,7 @@ def extract_planar(
         notes.append(empty_level_set(model, has_flat_regions=bool(extraction.flat_regions)))
     else:
         with phases.phase("check"):
-            residuals, failed = _residuals(model, found.points, run.runtime)
+            residuals, failed = _residuals(model, found.points, run.runtime, extraction.position_error)
             problems += failed
     report = {
         **model_entries(model),
@@ -115,11 +115,13 @@ def _measures(level_set: Curve | Roots) -> dict[str, Any]:
     }
 
 
-def _residuals(model: Model, points: Floats, runtime: Runtime | None) -> tuple[dict[str, float | None], list[str]]:
+def _residuals(
+    model: Model, points: Floats, runtime: Runtime | None, position_error: float | None
+) -> tuple[dict[str, float | None], list[str]]:
     residual = np.abs(evaluate(model.network, points))
     # Points lie on knots, where the slope is that of one side: so the steepest of all.
     steepest = np.linalg.norm(gradient(model.network, points), axis=1).max()
-    moved = steepest * position_rounding(model) * np.sqrt(model.dimension)
+    moved = steepest * (position_error or position_rounding(model)) * np.sqrt(model.dimension)
     allowed = RESIDUAL_SLACK * float64_error_bound(model.network, points) + moved
     worst = int(np.argmax(residual - allowed))
     problems = []

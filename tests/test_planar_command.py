@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import onnx
 import pytest
+from onnx_models import model_of, node
 
 import mn_onnx
 from mn_onnx.cli import EXIT_CHECK, EXIT_USAGE, main
@@ -109,3 +110,24 @@ def test_a_loaded_model_takes_no_further_options() -> None:
     model = mn_onnx.load(ball(0.5, 2))
     with pytest.raises(mn_onnx.UsageError, match="loaded already: give level to load"):
         mn_onnx.extract_planar(model, level=0.1)
+
+
+def test_rounding_of_points_taken_back_is_no_fault() -> None:
+    """|leaky(2 x + 2 y - 1)| = |leaky(1 - 2 y)|: perturbed, points move far, and with them rounding errors."""
+    nodes = [
+        node("Gemm", ["x", "W", "b"], ["h"]),
+        node("LeakyRelu", ["h"], ["l"]),
+        node("Abs", ["l"], ["a"]),
+        node("Gemm", ["a", "O", "one"], ["g"]),
+        node("Relu", ["g"], ["r"]),
+        node("Sub", ["r", "one"], ["y"]),
+    ]
+    constants = {
+        "W": np.array([[-2, 0], [-2, -2]], np.float32),
+        "b": np.ones(2, np.float32),
+        "O": np.array([[-1], [1]], np.float32),
+        "one": np.ones(1, np.float32),
+    }
+    found = mn_onnx.extract_planar(model_of(nodes, constants, inputs={"x": ("N", 2)}))
+    assert found.report["problems"] == []
+    assert found.report["max_abs_f"] < 1e-12
