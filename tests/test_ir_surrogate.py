@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import importlib
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -162,3 +164,20 @@ def test_deviation_encloses_and_is_attained(
     assert values.max() - rounding <= sure.upper[0]
     spread = attained.upper[0] - attained.lower[0]
     assert sure.upper[0] - sure.lower[0] <= 1.05 * spread + 1e-10
+
+
+def test_where_a_function_is_zero_nothing_is_refined(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Rounded outward, zero is a range around it, and no fraction of zero is a gap that would do."""
+    module = importlib.import_module("mn_onnx.ir.scalar.deviation")
+    sizes, bounds = [], module._cell_bounds
+
+    def counted(expression: Expression, low: np.ndarray, *rest: np.ndarray) -> object:
+        sizes.append(low.size)
+        return bounds(expression, low, *rest)
+
+    monkeypatch.setattr(module, "_cell_bounds", counted)
+    function = apply("maximum", apply("add", apply("multiply", T, apply("tanh", T)), constant(-9.0)), constant(0.0))
+    edges = np.linspace(-4.0, 3.0, 8)
+    sure, _ = module.deviation(function, edges[:-1], edges[1:], np.full(7, 1e-323), np.full(7, 1e-323))
+    assert sure.magnitude.max() < 1e-300
+    assert max(sizes) < 100

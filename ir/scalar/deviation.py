@@ -76,6 +76,7 @@ def deviation(
         np.minimum.at(attained_low, owner, cells.attained_low)
         np.maximum.at(attained_high, owner, cells.attained_high)
         gap = RELATIVE_GAP * np.maximum(attained_high - attained_low, 0.0)[owner] + SMALLEST_GAP * cells.scale
+        gap += np.finfo(np.float64).tiny  # where the function is zero throughout, of which nothing is a fraction
         settled = (cells.high <= attained_high[owner] + gap) & (cells.low >= attained_low[owner] - gap)
         settled |= is_finest(low, high, 0.0) | ~np.isfinite(cells.scale)
         if round_number == MOST_ROUNDS - 1 or 2 * (~settled).sum() > MOST_CELLS:
