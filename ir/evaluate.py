@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from mn_onnx.ir.evaluator import Evaluator
 from mn_onnx.ir.network import Floats, Network
-from mn_onnx.ir.rounding import float32_error_bound, float64_error_bound, rounding_error_bound, rounding_error_bounds
+from mn_onnx.ir.rounding import float64_error_bound, rounding_error_bound, rounding_error_bounds
 
 __all__ = [
     "evaluate",
-    "float32_error_bound",
     "float64_error_bound",
     "gradient",
     "rounding_error_bound",

@@ -13,5 +13,5 @@ _OPTIONS: dict[str, Any] = {"cache": True, "no_cfunc_wrapper": True}
 kernel = numba.njit(error_model="numpy", **_OPTIONS)
 # The same, put into its callers before types are inferred, so that each of them can have its own.
 inlined_kernel = numba.njit(error_model="numpy", inline="always", **_OPTIONS)
-# For kernels that Python calls, also by several threads at once: a division by zero is an error.
+# For kernels that Python calls, by several threads at once, and what they call: a division by zero is an error.
 threaded_kernel = numba.njit(nogil=True, **_OPTIONS)

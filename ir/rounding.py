@@ -11,7 +11,7 @@ from mn_onnx.ir.levels import contiguous
 from mn_onnx.ir.network import Floats, Network
 from mn_onnx.ir.scalar.running_error import running_error
 
-SINGLE, DOUBLE = 2.0**-24, 2.0**-53
+DOUBLE = 2.0**-53
 # Operations per term besides the dot product itself: scaling, bias, normalisation and casts that were fused into a row.
 FUSED_OPERATIONS = 8
 
@@ -131,11 +131,6 @@ def _chunk_bounds(evaluator: Evaluator, points: Floats, unit: float) -> tuple[Fl
         smooth += (np.abs(of_units) * level.rounding).sum(axis=1)
         adjoint[:, contiguous(block.columns)] += of_units @ block.weights
     return smooth, smooth + bent
-
-
-def float32_error_bound(network: Network, points: Floats, *, unit_roundoff: float = SINGLE) -> Floats:
-    """`rounding_error_bound` of the true functions in float32 (``unit_roundoff=2**-11``: float16), float64 [n]."""
-    return rounding_error_bound(network, points, unit_roundoff=unit_roundoff)
 
 
 def float64_error_bound(network: Network, points: Floats) -> Floats:

@@ -15,7 +15,7 @@ from small_models import octahedron_model
 import mn_onnx
 from mn_onnx.checks.parity import check_parity, coarsest_rounding, probe_points
 from mn_onnx.checks.runtime import BATCH, Runtime
-from mn_onnx.ir.evaluate import float32_error_bound
+from mn_onnx.ir.evaluate import rounding_error_bound
 
 Floats = NDArray[np.float64]
 
@@ -89,7 +89,7 @@ def test_rounding_of_constants_that_cancel_is_allowed_for() -> None:
     runtime = Runtime(model.read, model.imported.layout)
     points = probe_points(model)
     difference = np.abs(runtime.evaluate(points) - model.evaluate(points))
-    assert (difference > float32_error_bound(model.imported.network, points)).any()
+    assert (difference > rounding_error_bound(model.imported.network, points, unit_roundoff=2.0**-24)).any()
     assert check_parity(model, runtime).problems() == []
 
 

@@ -173,7 +173,8 @@ def count_small(X, values, count, rounding):
 def emit_choice(F, N, X, J, M, output, tables, slot_of_tag, cell, cell_rows, system, floats):
     """Emit the polygon of the chosen states, if the surface has one there.
 
-    Returns 1 if the cell is too degenerate to be cut, or the polygon reaches a plane that trimmed the cell, else 0.
+    Returns 1 if the cell is too degenerate to be cut, if rounding decides whether there is a polygon, or if the polygon
+    reaches a plane that trimmed the cell, else 0.
     """
     rows = N[system + SYS_ROWS]
     row_unit = system + SYS_HEADER + N[system + SYS_LEVELS] + 1

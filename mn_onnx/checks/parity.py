@@ -28,7 +28,7 @@ BATCH_SIZES = (1, 2, 7)
 """Besides one large batch: a network whose value at a point depends on the other points differs between them."""
 
 MOST_UNEXPLAINED = 0.05
-"""Points at which the difference may be explained by knots only; an operator that is read wrongly is so at most."""
+"""The part of the points at which knots only may explain the difference; a misread operator differs at nearly all."""
 
 LEAST_ALLOWED_SHARE = 0.25
 """What is allowed everywhere, as a share of the median: constants that cancel, as in ``(y + 1) - 1``, become one when a
