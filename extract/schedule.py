@@ -52,9 +52,9 @@ Integers = NDArray[np.int64]
 LEAF_CHOICES = 8
 # Cells with one in so many of the network's units left are large: see `how_to_bound` and LEAST_SETTLED.
 LARGE_SHARE = 4
-# Cells are shaved (see `kernels.shave`) if their systems have so many levels and units: bounds of shallow systems are
-# tight without, and slices of small ones cost what they save (measured: 16 to 32 units do equally well).
-SHAVED_LEVELS, SHAVED_UNITS = 5, 24
+# Errors of every single unit are tracked in systems of so many levels and units, see `how_to_bound`: bounds of shallow
+# systems are tight without, and for small ones it costs what it saves (measured: 16 to 32 units do equally well).
+TRACKED_LEVELS, TRACKED_UNITS = 5, 24
 # Work between two looks at the world, in weights: some ten milliseconds; and while another worker waits for work.
 BUDGET, BUDGET_WHILE_ASKED = 64_000_000, 400_000
 BUFFER_CORNERS = 1 << 17  # so that no array is so large that numpy asks for huge pages, which are slow to get
@@ -130,8 +130,8 @@ class _Worker:
         self.N = np.empty(max(1 << 16, 2 * packed.N.size), np.int64)
         self.control = np.zeros(entries.CONTROL_SIZE, np.int64)
         self.control[entries.LEAF_CHOICES] = LEAF_CHOICES
-        self.control[entries.SHAVED_LEVELS] = SHAVED_LEVELS
-        self.control[entries.SHAVED_UNITS] = SHAVED_UNITS
+        self.control[entries.TRACKED_LEVELS] = TRACKED_LEVELS
+        self.control[entries.TRACKED_UNITS] = TRACKED_UNITS
         self.control[entries.LARGE_UNITS] = -(-int(packed.N[SYS_UNITS]) // LARGE_SHARE)
         self.stack = np.zeros(1024, np.int64)
         self.slot_of_tag = np.zeros(first_trim_tag(packed.tables.n_knots) + 2 * TRIMMED_DEPTHS, np.int64)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from hypothesis import strategies as st
 
@@ -40,6 +42,22 @@ def dense(sizes: list[int], function: ScalarFunction = RELU, *, seed: int = 0, d
         below = np.arange(dimension + len(units) - size, dimension + len(units))
     output = AffineRow(below, rng.normal(size=below.size) / np.sqrt(below.size), 0.05)
     return Network(dimension, tuple(units), output)
+
+
+def with_flat_units(layers: list[int], seed: int) -> Network:
+    """Dense layers of ReLU; every third unit's output is divided by 4,096, and the weights on it are multiplied."""
+    network = dense(layers, seed=seed)
+    flat = KnotTable.exact([0.0], [[0.0, 2.0**-12]], [[0.0, 0.0]])
+
+    def scaled(row: AffineRow) -> AffineRow:
+        is_flat = (row.columns >= 3) & (row.columns % 3 == 0)
+        return replace(row, weights=np.where(is_flat, 2.0**12, 1.0) * row.weights)
+
+    units = [
+        replace(unit, row=scaled(unit.row), functions=(flat,) if g % 3 == 0 else unit.functions)
+        for g, unit in enumerate(network.units)
+    ]
+    return Network(3, tuple(units), scaled(network.output))
 
 
 @st.composite

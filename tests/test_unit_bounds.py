@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from ir_networks import dense, naive_values
+from ir_networks import dense, naive_values, with_flat_units
 from numba import njit
 from numpy.typing import NDArray
 
@@ -29,7 +29,7 @@ from mn_onnx.extract.kernels.memory import (
 )
 from mn_onnx.extract.pack import Packed, pack
 from mn_onnx.extract.schedule import traverse
-from mn_onnx.ir.network import AffineRow, KnotTable, Network
+from mn_onnx.ir.network import AffineRow, Network
 from mn_onnx.ir.passes import canonicalize
 from oracle.random_networks import random_tables
 
@@ -152,25 +152,9 @@ def test_units_proved_zero_before_need_no_row_of_errors(layers: list[int]) -> No
     assert np.all(highest[without_row] < 0.0)
 
 
-def _with_flat_units(layers: list[int], seed: int) -> Network:
-    """Dense layers of ReLU; every third unit's output is divided by 4,096, and the weights on it are multiplied."""
-    network = dense(layers, seed=seed)
-    flat = KnotTable.exact([0.0], [[0.0, 2.0**-12]], [[0.0, 0.0]])
-
-    def scaled(row: AffineRow) -> AffineRow:
-        is_flat = (row.columns >= 3) & (row.columns % 3 == 0)
-        return replace(row, weights=np.where(is_flat, 2.0**12, 1.0) * row.weights)
-
-    units = [
-        replace(unit, row=scaled(unit.row), functions=(flat,) if g % 3 == 0 else unit.functions)
-        for g, unit in enumerate(network.units)
-    ]
-    return Network(3, tuple(units), scaled(network.output))
-
-
 def test_errors_go_on_through_flat_outputs_as_their_own() -> None:
     plain = canonicalize(dense([24] * 6, seed=2), lower=LOWER, upper=UPPER).network
-    network = canonicalize(_with_flat_units([24] * 6, seed=2), lower=LOWER, upper=UPPER).network
+    network = canonicalize(with_flat_units([24] * 6, seed=2), lower=LOWER, upper=UPPER).network
     _, _, without_flat = _radii(pack(plain, LOWER, UPPER), True)
     low, high, tracked = _radii(pack(network, LOWER, UPPER), True)
     _, _, summed = _radii(pack(network, LOWER, UPPER), False)

@@ -9,8 +9,8 @@ from __future__ import annotations
 from numba import types
 
 from mn_onnx.extract.kernels.bound import bound_output
-from mn_onnx.extract.kernels.fold import fold
-from mn_onnx.extract.kernels.records import Tables
+from mn_onnx.extract.kernels.leaf import emit_leaf
+from mn_onnx.extract.kernels.records import OutputArrays, Tables
 from mn_onnx.extract.kernels.shave import shave_cell
 from mn_onnx.extract.kernels.split import trim_cell
 
@@ -19,6 +19,8 @@ _NUMBER, _VALUE = types.int64, types.float64
 _TABLES = types.NamedTuple(
     (_INTEGERS, _FLOATS, _INTEGERS, _FLOATS, _FLOATS, _INTEGERS, _INTEGERS, _NUMBER, _VALUE), Tables
 )
+_POINTS, _FACES = types.CPointer(types.int32), types.CPointer(types.int8)
+_OUTPUT = types.NamedTuple((_INTEGERS, _POINTS, _FLOATS, _POINTS, _FLOATS, _INTEGERS, _FACES, _POINTS), OutputArrays)
 
 
 def compile_ahead() -> None:
@@ -26,6 +28,6 @@ def compile_ahead() -> None:
     bound_output.compile((_FLOATS, _INTEGERS, _FLOATS, _NUMBER, _VALUE, *[_NUMBER] * 3, _VALUE))
     arrays = (_FLOATS, _INTEGERS, _FLOATS, _INTEGERS, _NUMBER)  # F, N, X, J, M
     trim_cell.compile((*arrays, _INTEGERS, _TABLES, _INTEGERS, *[_NUMBER] * 2, *[_VALUE] * 4))
-    fold.compile((*arrays, *[_NUMBER] * 5))
     scratch = (_FLOATS, _INTEGERS, _INTEGERS)  # S, K, control
-    shave_cell.compile((*arrays, *scratch, _TABLES, _INTEGERS, *[_NUMBER] * 5))
+    shave_cell.compile((*arrays, *scratch, _TABLES, _INTEGERS, *[_NUMBER] * 6))
+    emit_leaf.compile((*arrays, _OUTPUT, _TABLES, _INTEGERS, *[_NUMBER] * 4))

@@ -10,7 +10,14 @@ from __future__ import annotations
 import numpy as np
 
 from mn_onnx.extract.kernels.centres import read_outputs, read_tracked_outputs, row_extremes
-from mn_onnx.extract.kernels.error_symbols import ROWS_BEYOND, clear_row, number_errors, track_errors, track_output
+from mn_onnx.extract.kernels.error_symbols import (
+    ROWS_BEYOND,
+    clear_row,
+    number_errors,
+    table_at,
+    track_errors,
+    track_output,
+)
 from mn_onnx.extract.kernels.lanes import (
     fma,
     halves,
@@ -46,9 +53,7 @@ from mn_onnx.extract.kernels.memory import (
     SYS_ROWS,
     SYS_SINGLE,
     UNSTABLE,
-    aligned,
     padded,
-    symbol_stride,
     weights_of,
 )
 from mn_onnx.extract.kernels.polytope import evaluate_affine, value_range
@@ -96,11 +101,8 @@ def bound_units(F, N, X, J, M, tables, cell, system, floats, scratch, tracked, l
     row_col = row_unit + rows
     col_end = row_col + rows + 1 + 2 * cols
     weights = weights_of(floats, rows)
-    stride = symbol_stride(cols)
-    errors = 2 * aligned(scratch)  # in float32
-    # After the rows of units, the output's and one of zeros.
-    own = errors + (rows + ROWS_BEYOND) * stride
-    nothing = rows + ROWS_BEYOND + 1
+    errors, own, stride = table_at(scratch, rows, cols)
+    nothing = rows + ROWS_BEYOND + 1  # after the rows of units and the output's, one of zeros
     read = own + 2 * stride
     if tracked:
         clear_row(F, own + stride, stride)

@@ -6,7 +6,7 @@ from __future__ import annotations
     range(13)
 )
 (BROKEN_CUTS, DEEPEST, NEED_CORNERS, NEED_POLYGONS, LARGE_UNITS, ASKED) = range(13, 19)
-(SHAVED_LEVELS, SHAVED_UNITS, SHAVED, PROFILE) = range(19, 23)
+(TRACKED_LEVELS, TRACKED_UNITS, SHAVED, PROFILE) = range(19, 23)
 # Nodes and cycles per power of two of unstable units, then per number of layers that have any.
 PROFILE_BINS = 16
 CONTROL_SIZE = PROFILE + 4 * PROFILE_BINS

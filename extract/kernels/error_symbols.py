@@ -47,7 +47,9 @@ from mn_onnx.extract.kernels.memory import (
     LIVE,
     LIVE_AT,
     LIVE_ROWS,
+    OFFSET,
     OUT_COEF,
+    OUTPUT_ROUNDING,
     OUTPUTS,
     RADIUS,
     READ_AT,
@@ -56,9 +58,16 @@ from mn_onnx.extract.kernels.memory import (
     READ_ROW,
     READ_SLOPE,
     READ_SYMBOL,
+    ROUNDING_SHARE,
     SLOPE,
+    SYMBOL_AT,
     SYMBOL_ERROR,
+    SYMBOL_OFFSET,
     SYMBOL_OUTPUT,
+    SYMBOL_RADIUS,
+    SYMBOL_ROW,
+    SYMBOL_SLOPE,
+    aligned,
     symbol_stride,
 )
 from mn_onnx.extract.kernels.relax import MARGIN
@@ -221,7 +230,9 @@ def number_errors(X, J, M, level, level_begin, begin, end, nothing):
     """A symbol for each of the outputs ``begin:end`` of a level that has an error of its own.
 
     J[READ_ROW] of the outputs becomes their row of the table; ``nothing``: one of zeros;
-    ``level_begin``: the level's first row. Returns whether all errors are of a size for float32.
+    ``level_begin``: the level's first row. For `slices`, a symbol keeps its row (J[SYMBOL_ROW]), that of the table
+    (J[SYMBOL_AT]), and the output's chord and error (X[SYMBOL_SLOPE], X[SYMBOL_OFFSET], X[SYMBOL_RADIUS]). Returns
+    whether all errors are of a size for float32.
     """
     symbols, fit = J[LEVEL_SYMBOL * M + level], True
     for p in range(begin, end):
@@ -231,10 +242,13 @@ def number_errors(X, J, M, level, level_begin, begin, end, nothing):
         J[READ_ROW * M + p] = J[LEVEL_ROW * M + level] + place
         slope, error = X[SLOPE * M + c], X[ERROR * M + c]
         X[READ_RADIUS * M + p] = abs(slope) * X[RADIUS * M + row] + error
+        J[SYMBOL_ROW * M + symbols], J[SYMBOL_AT * M + symbols] = row, J[READ_ROW * M + p]
+        X[SYMBOL_SLOPE * M + symbols], X[SYMBOL_OFFSET * M + symbols] = slope, X[OFFSET * M + c]
         if abs(slope) < LEAST_SLOPE:
             # All errors of so flat an output are its own.
             slope, error = 1.0, X[READ_RADIUS * M + p]
             J[READ_ROW * M + p] = nothing
+        X[SYMBOL_RADIUS * M + symbols] = error
         X[READ_SLOPE * M + p] = slope
         J[READ_SYMBOL * M + p] = symbols
         J[SYMBOL_OUTPUT * M + symbols] = p
@@ -305,7 +319,8 @@ def centre_output(F, X, J, M, out_weights, constants, count):
 def track_output(F, X, J, M, out_weights, constants, levels, count, errors, own, stride, read, rounding):
     """The output's linear centre (X[CENTRE_AT], four numbers) and its radius, which is returned.
 
-    After all ``levels``; ``own``: scratch of ``stride`` numbers. The others as for `track_errors` and `centre_output`.
+    After all ``levels``; ``own``: where its row of the table goes, ``stride`` numbers. What rounding may have taken off
+    errors is left in X[CENTRE_AT] too. The others as for `track_errors` and `centre_output`.
     """
     E = as_singles(F)
     growth = centre_output(F, X, J, M, out_weights, constants, count)
@@ -324,7 +339,20 @@ def track_output(F, X, J, M, out_weights, constants, levels, count, errors, own,
         for p in range(J[LEVEL_OUTPUT * M + level], end, 4):
             add_four(E, J, own, known, errors, stride, READ_ROW * M + p, min(4, end - p), read + p)
     rounding += ROUNDING * (count + (symbols >> 4) + 16)
+    X[CENTRE_AT * M + ROUNDING_SHARE] = rounding + MARGIN
+    X[CENTRE_AT * M + OUTPUT_ROUNDING] = (rounding + MARGIN) * growth + TINY
     return summed_errors(E, own, symbols, growth, rounding)
+
+
+@kernel
+def table_at(scratch, rows, cols):
+    """Where the table of errors of a system is if F's scratch begins at ``scratch``: counted in float32.
+
+    Returns the places of its first row and of the output's row, and from one row to the next.
+    """
+    stride = symbol_stride(cols)
+    errors = 2 * aligned(scratch)
+    return errors, errors + (rows + ROWS_BEYOND) * stride, stride
 
 
 @kernel

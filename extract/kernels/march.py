@@ -1,7 +1,7 @@
 """Branch and fold: the depth-first traversal of one worker, resumable after any cell.
 
-A cell is bounded, dropped if the output cannot reach the level there, trimmed to where it can, folded when enough of
-its units have settled, in deep networks shaved of slices that the surface misses (`shave`), and split along a knot of a
+A cell is bounded, dropped if the output cannot reach the level there, trimmed to where it can, in deep networks shaved
+of slices that the surface misses (`shave`), folded when enough of its units have settled, and split along a knot of a
 unit whose pre-activation is already affine on it; small cells are emitted whole (`leaf`). Large cells are bounded no
 further than it seems worth it (LEAST_SETTLED), and in deep networks only at some depths (`how_to_bound`); then they are
 only split.
@@ -39,6 +39,8 @@ from mn_onnx.extract.kernels.control import (
     STOP,
     TOP_F,
     TOP_I,
+    TRACKED_LEVELS,
+    TRACKED_UNITS,
     TRIMMED,
 )
 from mn_onnx.extract.kernels.error_symbols import tracking_floats
@@ -51,6 +53,7 @@ from mn_onnx.extract.kernels.memory import (
     CELL_END_F,
     CELL_END_I,
     CELL_HEADER,
+    CELL_SINCE,
     CELL_SYSTEM_F,
     CELL_SYSTEM_I,
     CELL_VERTICES,
@@ -74,7 +77,7 @@ from mn_onnx.extract.kernels.memory import (
 )
 from mn_onnx.extract.kernels.polytope import most_vertices
 from mn_onnx.extract.kernels.records import OutputArrays, Tables
-from mn_onnx.extract.kernels.shave import LOOSE_SHARE, NO_SURFACE, STATELESS, is_worth_shaving, shave_cell
+from mn_onnx.extract.kernels.shave import LOOSE_SHARE, NO_SURFACE, STATELESS, shave_cell
 from mn_onnx.extract.kernels.split import (
     SHAVED_TRIMMED_SHARE,
     TRIMMED_SHARE,
@@ -89,10 +92,13 @@ DONE, BUDGET_USED, ARENA_FULL, SCRATCH_FULL, OUTPUT_FULL, STACK_FULL, STOPPED = 
 
 # Systems of fewer units are folded freely; see `how_to_fold`.
 SMALL_SYSTEM = 64
-# In systems of so many levels and units, radii come from every unit's own error on cells of every third depth; such a
-# bound costs twice as much and settles twice as many units. Between them, large systems are not bounded: what summed
-# radii settle there is not worth reading the weights.
-TRACKED_LEVELS, TRACKED_UNITS, TRACKED_DEPTHS = 5, 24, 3
+# In deep systems, radii come from every unit's own error on cells of every third depth; such a bound costs twice as
+# much and settles twice as many units. Between them, large systems are not bounded: what summed radii settle there is
+# not worth reading the weights.
+TRACKED_DEPTHS = 3
+# Errors are tracked once more before a cell is split if no more than this share of its units is left after it has been
+# trimmed or shaved: that costs little then. Measured: 1/2 to 4/5 do equally well.
+TRACKED_AGAIN = 2 / 3
 # What a cell takes besides its weights, in weights.
 CELL_WORK = 8000
 # How the units of a cell are bounded.
@@ -143,6 +149,12 @@ def point_at_output(output):
 
 
 @kernel
+def parts_floats(vertices):
+    """Room in F for what is left of a cell of so many vertices when it is trimmed and shaved: two cuts each."""
+    return 4 * 3 * padded(most_vertices(vertices, np.int64(3)))
+
+
+@kernel
 def missing_room(N, control, room, counts, cell, rows, cols, levels):
     """The status to return if the next cell might not fit anywhere, else DONE; sets the NEED_* entries."""
     vertices = N[cell + CELL_VERTICES]
@@ -150,8 +162,9 @@ def missing_room(N, control, room, counts, cell, rows, cols, levels):
     most = most_vertices(vertices, np.int64(3))
     parts = 2  # without states
     choices = control[LEAF_CHOICES]
-    tracking = tracking_floats(rows, cols) if levels >= TRACKED_LEVELS else 0
-    need_f = control[TOP_F] + max(tracking, folding_floats(rows, cols) + 3 * (4 + parts) * padded(most))
+    tracking = tracking_floats(rows, cols) if levels >= control[TRACKED_LEVELS] else 0
+    after = folding_floats(rows, cols) + 3 * parts * padded(most)
+    need_f = control[TOP_F] + parts_floats(vertices) + max(tracking, after)
     polytopes = 4 * cell_ints(rows, most) + parts * cell_ints(STATELESS, most)
     need_i = control[TOP_I] + system_ints(rows, cols, levels) + polytopes
     if need_f > room.floats or need_i > room.integers:
@@ -199,14 +212,25 @@ def how_to_fold(N, system, linear, dead):
 
 
 @kernel
-def how_to_bound(N, cell, system, large):
+def is_deep(N, control, system):
+    """Whether errors are tracked in some cells of this system."""
+    return N[system + SYS_LEVELS] >= control[TRACKED_LEVELS] and N[system + SYS_UNITS] >= control[TRACKED_UNITS]
+
+
+@kernel
+def how_to_bound(N, control, cell, system, large):
     """TRACKED for bounds from every unit's own error, SUMMED for sums of errors, FIRST_LEVEL for affine rows only."""
-    units = N[system + SYS_UNITS]
-    if N[system + SYS_LEVELS] < TRACKED_LEVELS or units < TRACKED_UNITS:
+    if not is_deep(N, control, system):
         return SUMMED
-    if N[cell + CELL_DEPTH] % TRACKED_DEPTHS == 0:
+    if N[cell + CELL_SINCE] % TRACKED_DEPTHS == 0:
         return TRACKED
     return FIRST_LEVEL if large else SUMMED
+
+
+@kernel
+def is_worth_tracking_again(N, control, system, folded):
+    """Whether a cell that has been trimmed or shaved is bounded again, with its folded system, before it is split."""
+    return is_deep(N, control, folded) and N[folded + SYS_UNITS] <= TRACKED_AGAIN * N[system + SYS_UNITS]
 
 
 @kernel
@@ -232,20 +256,22 @@ def visit(F, N, X, J, M, control, stack, output, tables, S, K, slot_of_tag, cell
     rows = N[system + SYS_ROWS]
     load_states(N, J, M, cell, rows)
     large = N[system + SYS_UNITS] >= control[LARGE_UNITS]
-    how = how_to_bound(N, cell, system, large)
+    how = how_to_bound(N, control, cell, system, large)
     if how == FIRST_LEVEL:
         bound_first_level(F, N, X, J, M, tables, cell, system, floats)
         row, knot = choose_split(N, X, J, M, tables, system)
         if row >= 0:
             split_cell(F, N, X, J, M, control, stack, tables, slot_of_tag, cell, rows, system, floats, row, row, knot)
             return
-    tracked = how != SUMMED
+    # What is left of the cell is written while the table of errors is still needed.
+    scratch = aligned(control[TOP_F] + parts_floats(N[cell + CELL_VERTICES]))
     linear, dead, bounded, radius = bound_units(
-        F, N, X, J, M, tables, cell, system, floats, control[TOP_F], tracked, large
+        F, N, X, J, M, tables, cell, system, floats, scratch, how != SUMMED, large
     )
+    tracked = radius >= 0.0
     leaf = is_leaf(N, J, M, control, system)
     whole = cell
-    loose = False
+    loose = changed = False
     if bounded:
         low, high, slack = bound_output(F, N, X, M, tables.extent, cell, system, floats, radius)
         if low > slack or high < -slack:
@@ -253,14 +279,32 @@ def visit(F, N, X, J, M, control, stack, output, tables, S, K, slot_of_tag, cell
             return
         loose = min(high, slack) - max(low, -slack) > LOOSE_SHARE * (high - low)
         if not leaf:
-            share = SHAVED_TRIMMED_SHARE if is_worth_shaving(N, control, system) else TRIMMED_SHARE
+            share = SHAVED_TRIMMED_SHARE if tracked else TRIMMED_SHARE
             cell = trim_cell(F, N, X, J, M, control, tables, slot_of_tag, cell, rows, low, high, slack, share)
     if cell != whole:
+        changed = True
         control[TRIMMED] += 1
         newly_linear, newly_dead = settle_again(F, N, X, J, M, tables, cell, system, floats)
         linear += newly_linear
         dead += newly_dead
         leaf = is_leaf(N, J, M, control, system)
+    if tracked and loose and not leaf:
+        most = most_vertices(N[whole + CELL_VERTICES], np.int64(2))
+        part, settled = shave_cell(
+            F, N, X, J, M, S, K, control, tables, slot_of_tag, cell, rows, system, floats, scratch, most
+        )
+        if part == NO_SURFACE:
+            control[PRUNED] += 1
+            return
+        if part != cell or settled > 0:
+            changed = True
+            if part != cell:
+                control[SHAVED] += 1
+                cell, rows = part, STATELESS
+            newly_linear, newly_dead = settle_again(F, N, X, J, M, tables, cell, system, floats)
+            linear += newly_linear
+            dead += newly_dead
+            leaf = is_leaf(N, J, M, control, system)
     row, knot = -1, 0
     if not leaf:
         row, knot = choose_split(N, X, J, M, tables, system)
@@ -280,29 +324,15 @@ def visit(F, N, X, J, M, control, stack, output, tables, S, K, slot_of_tag, cell
         control[LEAVES] += 1
         control[BROKEN_CUTS] += emit_leaf(F, N, X, J, M, output, tables, slot_of_tag, cell, rows, folded, folded_floats)
         return
-    changed = cell != whole
-    if loose and is_worth_shaving(N, control, folded):
-        most = most_vertices(N[whole + CELL_VERTICES], np.int64(2))
-        shaved, settled = shave_cell(
-            F, N, X, J, M, S, K, control, tables, slot_of_tag, cell, rows, folded, folded_floats, most
-        )
-        if shaved == NO_SURFACE:
-            control[PRUNED] += 1
-            return
-        if shaved != cell or settled > 0:
-            changed = True
-            if shaved != cell:
-                control[SHAVED] += 1
-                cell, rows = shaved, STATELESS
-            bound_first_level(F, N, X, J, M, tables, cell, folded, folded_floats)
-            row, knot = choose_split(N, X, J, M, tables, folded)
-            form = row
-    if row >= 0:
+    if tracked and changed and is_worth_tracking_again(N, control, system, folded):
+        push_trimmed(F, N, J, M, control, stack, cell, rows, folded, folded_floats, np.int64(0))
+    elif row >= 0:
         split_cell(
             F, N, X, J, M, control, stack, tables, slot_of_tag, cell, rows, folded, folded_floats, row, form, knot
         )
-    elif changed:
-        push_trimmed(F, N, J, M, control, stack, cell, rows, folded, folded_floats)
+    elif changed:  # none of the affine rows has a knot in it any more
+        since = N[cell + CELL_SINCE] + 1
+        push_trimmed(F, N, J, M, control, stack, cell, rows, folded, folded_floats, since)
     else:
         control[BROKEN_CUTS] += 1  # only if the network is not finite here: the first unstable row is affine
 

@@ -36,7 +36,8 @@ SYS_ROWS, SYS_COLS, SYS_LEVELS, SYS_FLOATS, SYS_INTS, SYS_UNITS, SYS_HASH = 0, 1
 SYS_SINGLE, SYS_HEADER = 8, 9  # 1 if every unit of the network has one output
 
 CELL_SYSTEM_F, CELL_SYSTEM_I, CELL_VERTICES, CELL_CAPACITY, CELL_FLOATS = 0, 1, 2, 3, 4
-CELL_END_F, CELL_END_I, CELL_DEPTH, CELL_HEADER = 5, 6, 7, 8
+# CELL_SINCE: splits since the root, or since a cell was pushed to be tracked again (`march`).
+CELL_END_F, CELL_END_I, CELL_DEPTH, CELL_SINCE, CELL_HEADER = 5, 6, 7, 8, 9
 
 # Scratch regions of X. CENTRE takes four (the affine coefficients of every row), POLY_A and POLY_B three, FORMS four.
 (CENTRE, RADIUS, LOW, HIGH, SLOPE, OFFSET, ERROR, OUT_COEF) = (0, 4, 5, 6, 7, 8, 9, 10)
@@ -45,7 +46,11 @@ OUTPUTS = 28  # five
 GROWTH, SETTLED_SLOPE = 33, 34
 CHOSEN = 35  # four
 READ_SLOPE, READ_RADIUS, SYMBOL_ERROR, REACH = 39, 40, 41, 42
-X_REGIONS = 43
+SYMBOL_SLOPE, SYMBOL_OFFSET, SYMBOL_RADIUS = 43, 44, 45
+X_REGIONS = 46
+# In X[CENTRE_AT], after the output's linear centre, where errors are tracked: the most that rounding can have taken off
+# a row's errors, as a share of X[GROWTH], and off the output's, as it is.
+ROUNDING_SHARE, OUTPUT_ROUNDING = 4, 5
 # Kernels are called with these. numba compiles a kernel once more for every constant among its arguments, except for
 # numpy's: so their numbers are numpy's, as are the constants in the kernels' calls of each other.
 VALUES, OUT_VALUES, POLY_A, POLY_B = np.int64(11), np.int64(12), np.int64(13), np.int64(16)
@@ -59,7 +64,8 @@ TAGS_A, TAGS_B = np.int64(8), np.int64(9)  # kernels are called with them
 (KEPT, PLACE, OLD_COL, SETTLED_ROW, COL_KIND) = (25, 26, 27, 28, 29)
 SINCE, UNTIL = np.int64(30), np.int64(31)
 READ_SYMBOL, SYMBOL_OUTPUT, LIVE, LIVE_AT, LIVE_ROWS, LEVEL_ROW = 32, 33, 34, 35, 36, 37
-J_REGIONS = 38
+SYMBOL_ROW, SYMBOL_AT = 38, 39
+J_REGIONS = 40
 
 # What F has for every row of a system, apart from the weights: the affine part, and the two pieces around its knot.
 PIECE_FLOATS = 5

@@ -2,15 +2,16 @@
 
 Bounds get tighter with the size of what they are for, and faster so than linearly in deep networks, where the range of
 a unit grows by the widths of all levels before. So thin slices of a cell can be dropped that no bound on the whole cell
-excludes. The idea is that of constraint programming (3B consistency: Lhomme, Consistency Techniques for Numeric CSPs,
-IJCAI 1993). The slices lie along the planes where the output's linear centre is constant, as those of `trim_cell` do.
+excludes. What the errors tracked for the cell tell of its slices costs a fraction of tracking them (`slices`). The idea
+is that of constraint programming (3B consistency: Lhomme, Consistency Techniques for Numeric CSPs, IJCAI 1993). The
+slices lie along the planes where the output's linear centre is constant, as those of `trim_cell` do.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-from mn_onnx.extract.kernels.control import SHAVED_LEVELS, SHAVED_UNITS
+from mn_onnx.extract.kernels.error_symbols import table_at
 from mn_onnx.extract.kernels.masks import lowest_bit
 from mn_onnx.extract.kernels.memory import (
     CELL_CAPACITY,
@@ -18,8 +19,8 @@ from mn_onnx.extract.kernels.memory import (
     CENTRE_AT,
     OUT_VALUES,
     SIDE_COUNTS,
-    SYS_LEVELS,
-    SYS_UNITS,
+    SYS_COLS,
+    SYS_ROWS,
     TRIMMED_DEPTHS,
     VALUES,
     first_trim_tag,
@@ -45,12 +46,6 @@ NO_SURFACE = -1
 
 
 @kernel
-def is_worth_shaving(N, control, system):
-    """Whether slices of cells of this system are likely to save more than they cost."""
-    return N[system + SYS_LEVELS] >= control[SHAVED_LEVELS] and N[system + SYS_UNITS] >= control[SHAVED_UNITS]
-
-
-@kernel
 def cut_off(F, N, X, J, M, control, slot_of_tag, cell, rows, limit, kept_side, tag, most):
     """The part of the cell on one side of the plane where the output's centre is ``limit``, without states.
 
@@ -67,13 +62,13 @@ def cut_off(F, N, X, J, M, control, slot_of_tag, cell, rows, limit, kept_side, t
 
 
 @kernel
-def shave_cell(F, N, X, J, M, S, K, control, tables, slot_of_tag, cell, rows, system, floats, most):
+def shave_cell(F, N, X, J, M, S, K, control, tables, slot_of_tag, cell, rows, system, floats, scratch, most):
     """The cell without the slices at either end that the surface misses; NO_SURFACE if it misses all of them.
 
-    That is a polytope without states, or the cell itself if nothing goes. ``rows``: those of the cell's own system,
-    ``system`` the folded one, whose rows have their states in J; they are narrowed to those of the slices that
-    stay. ``most``: how many vertices a part may have. ``S``, ``K``: scratch, see `slice_points`. Also returns how many
-    rows have been settled.
+    That is a polytope without states, or the cell itself if nothing goes. The errors tracked for the cell, or for one
+    that it is part of, are still in F[scratch] (`bound_units`). States of the system's rows, in J, are narrowed to
+    those of the slices that stay; returns also how many are settled by that. ``rows``: those of the cell's states;
+    ``most``: how many vertices a part may have. ``S``, ``K``: scratch, see `slice_points`.
     """
     at = CENTRE_AT * M
     evaluate_affine(F, N, X, M, cell, OUT_VALUES, X[at], X[at + 1], X[at + 2], X[at + 3])
@@ -85,7 +80,8 @@ def shave_cell(F, N, X, J, M, S, K, control, tables, slot_of_tag, cell, rows, sy
         return cell, 0
     if not place_points(F, N, X, S, K, M, cell, rows, low, thickness):
         return cell, 0
-    kept = missed_slices(F, N, S, J, K, M, tables, system, floats) ^ ALL_SLICES
+    errors, own, stride = table_at(scratch, N[system + SYS_ROWS], N[system + SYS_COLS])
+    kept = missed_slices(F, N, X, S, J, K, M, tables, system, floats, errors, stride, own) ^ ALL_SLICES
     if kept == 0:
         return NO_SURFACE, 0
     tag = first_trim_tag(tables.n_knots) + 2 * depth

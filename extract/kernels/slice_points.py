@@ -21,18 +21,18 @@ from mn_onnx.ir.kernel import kernel
 
 SLICES, ALL_SLICES = 8, 0xFF  # one to a lane; as bits
 
-# Regions of the scratch S, in multiples of M. For every output that is not zero in all slices the five vectors of its
-# affine form and half width; for every column its slope, offset and error; for every row the output's derivative; the
-# lists of points; of every vertex how far it is above each plane; the forms of four rows; the range of one.
-OUTPUTS, PIECES, DERIVATIVES, POINTS, PLANE_VALUES, FORMS, RANGES = 0, 40, 64, 72, 112, 120, 121
-SLICE_FLOATS = 122
-# Regions of the scratch K: of every output that is not zero in all slices its column, its row and where its weights
-# begin; of every row the slices in which it is settled, as bits; the slice of every vertex; the numbers of points; the
-# rows of a level that are no padding.
-COLS, ROWS, WEIGHTS, ABOVE, UNDER, SLICE_OF, POINT_COUNTS, REAL_ROWS = 0, 1, 2, 3, 4, 5, 6, 7
-SLICE_INTEGERS = 8
-# Numbers in the vectors of a point, and of an output or a form.
-POINT, FORM = 3 * SLICES, 5 * SLICES
+# Regions of the scratch S, in multiples of M. For every symbol the five vectors of its affine form and radius; then
+# slope, offset and error of its chord, of which the slope becomes the output's derivative by the symbol's row; the
+# lists of points; of every vertex how far it is above each plane; the forms of four rows, or eight products; the chords
+# of one unit.
+SYMBOLS, PIECES, POINTS, PLANE_VALUES, FORMS, RELAXED = 0, 40, 64, 104, 112, 113
+SLICE_FLOATS = 114
+# Regions of the scratch K: of every symbol the slices in which its unit is settled, as bits; the slice of every vertex;
+# the numbers of points.
+ABOVE, UNDER, SLICE_OF, POINT_COUNTS = 0, 1, 2, 3
+SLICE_INTEGERS = 4
+# Numbers in the vectors of a point, of a chord, and of a symbol or a form.
+POINT, PIECE, FORM = 3 * SLICES, 3 * SLICES, 5 * SLICES
 
 
 @kernel

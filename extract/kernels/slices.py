@@ -1,68 +1,65 @@
 """Bounds of the output over eight parallel slices of a cell at once, one slice to a lane.
 
-The slices lie between nine planes, equally far apart, on which the output's linear centre is constant. Bounds are those
-of `bound` with summed radii, and every slice has relaxations of its own; but where there the lanes hold eight rows,
-here they hold eight slices, so that weights are read, and rows looked up, once for all of them.
+The slices lie between nine planes, equally far apart, on which the output's linear centre is constant. They are bounded
+by what `error_symbols` has found for the whole cell: there a pre-activation is its linear centre plus multiples of
+symbols, and a symbol is how far a unit's output is from the unit's chord, in units of the most that is,
+
+    t_i = c_i(x) + sum_j E_ij e_j,    e_j = (y_j(t_j) - s_j t_j - o_j) / m_j.
+
+In a slice, units have shorter chords, y = s' t + o' within m', so that e_j is affine in t_j with slope (s' - s) / m and
+error m' / m. Unlike in bounds from weights, a radius does not pass through s', but only through what is new in it, so
+that these bounds are nearly as tight as errors tracked anew, and cost the square of the number of undecided units.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-from mn_onnx.extract.kernels.lanes import (
-    fma,
-    load_wide,
-    magnitude,
-    splat_wide,
-    store,
-)
-from mn_onnx.extract.kernels.masks import (
-    at_least,
-    bits_of,
-    both,
-    either,
-    is_below,
-    mask_of,
-    same,
-)
+from mn_onnx.extract.kernels.error_symbols import LEAST_SLOPE, TINY
+from mn_onnx.extract.kernels.lanes import as_singles, fma, load_wide, magnitude, splat_wide, store
+from mn_onnx.extract.kernels.masks import at_least, bits_of, either, is_below, mask_of
 from mn_onnx.extract.kernels.memory import (
+    CENTRE_AT,
+    GROWTH,
+    LEVEL_SYMBOL,
+    OUTPUT_ROUNDING,
+    READ_COLS,
+    ROUNDING_SHARE,
     STATE_HIGH,
     STATE_LOW,
-    SYS_COLS,
+    SYMBOL_AT,
+    SYMBOL_OFFSET,
+    SYMBOL_OUTPUT,
+    SYMBOL_RADIUS,
+    SYMBOL_ROW,
+    SYMBOL_SLOPE,
     SYS_HEADER,
     SYS_LEVELS,
     SYS_ROWS,
     knots_of,
-    padded,
-    weights_of,
 )
 from mn_onnx.extract.kernels.relax import narrow_states, relax_one_knot, relax_piece_range, with_rounding
 from mn_onnx.extract.kernels.slice_points import (
     ABOVE,
     ALL_SLICES,
-    COLS,
-    DERIVATIVES,
     FORM,
     FORMS,
-    OUTPUTS,
+    PIECE,
     PIECES,
-    POINT,
-    RANGES,
-    REAL_ROWS,
-    ROWS,
+    RELAXED,
     SLICES,
+    SYMBOLS,
     UNDER,
-    WEIGHTS,
     value_ranges,
 )
 from mn_onnx.ir.kernel import kernel
 
 
 @kernel
-def relax_simple(F, K, M, table, rows, r, first, last, low, high):
+def relax_simple(F, K, M, table, rows, r, s, first, last, low, high):
     """Slopes, offsets and errors of a unit of one knot and one output, from its range in each slice.
 
-    Sets K[ABOVE] and K[UNDER] of its row.
+    Sets K[ABOVE] and K[UNDER] of its symbol ``s``.
     """
     knot = splat_wide(F[table + r])
     left, left_at = splat_wide(F[table + rows + r]), splat_wide(F[table + 2 * rows + r])
@@ -70,95 +67,100 @@ def relax_simple(F, K, M, table, rows, r, first, last, low, high):
     above, under = at_least(low, knot), is_below(high, knot)
     if first == last:
         above, under = mask_of(ALL_SLICES * first), mask_of(ALL_SLICES * (1 - first))
-    K[ABOVE * M + r], K[UNDER * M + r] = bits_of(above), bits_of(under)
+    K[ABOVE * M + s], K[UNDER * M + s] = bits_of(above), bits_of(under)
     return relax_one_knot(knot, left, left_at, right, right_at, low, high, above, under)
 
 
 @kernel
-def relax_tables(N, S, M, tables, row_col, r, unit, first, last, low, high):
-    """S[PIECES] of the columns of a unit of any table, from its range in each slice."""
-    store(S, RANGES * M, low)
-    store(S, RANGES * M + SLICES, high)
+def relax_table(S, M, tables, unit, output, first, last, low, high):
+    """Slopes, offsets and errors of an output of a unit of any table, from the unit's range in each slice."""
+    at = RELAXED * M
+    store(S, at, low)
+    store(S, at + SLICES, high)
     knot = tables.first_knot[unit]
     pieces = tables.first_knot[unit + 1] - knot + 1
-    for k in range(SLICES):
-        since, until, least, most = narrow_states(
-            tables.knots, knot, pieces, first, last, S[RANGES * M + k], S[RANGES * M + SLICES + k]
-        )
-        piece = tables.first_piece[unit]
-        for c in range(N[row_col + r], N[row_col + r + 1]):
-            at = PIECES * M + POINT * c + k
-            if since == until:
-                slope, offset, error = tables.slopes[piece + since], tables.intercepts[piece + since], 0.0
-            else:
-                slope, offset, error = relax_piece_range(
-                    tables.knots, tables.slopes, tables.intercepts, knot, piece, since, until, least, most
-                )
-            S[at], S[at + SLICES], S[at + 2 * SLICES] = slope, offset, error
-            piece += pieces
+    piece = tables.first_piece[unit] + output * pieces
+    for k in range(at, at + SLICES):
+        since, until, least, most = narrow_states(tables.knots, knot, pieces, first, last, S[k], S[k + SLICES])
+        if since == until:
+            slope, offset, error = tables.slopes[piece + since], tables.intercepts[piece + since], 0.0
+        else:
+            slope, offset, error = relax_piece_range(
+                tables.knots, tables.slopes, tables.intercepts, knot, piece, since, until, least, most
+            )
+        S[k], S[k + SLICES], S[k + 2 * SLICES] = slope, offset, error
+    return load_wide(S, at), load_wide(S, at + SLICES), load_wide(S, at + 2 * SLICES)
 
 
 @kernel
-def list_output(S, K, M, rows, r, c, count, c0, c1, c2, c3, growth, slope, offset, error):
-    """Append a column's outputs to the list, unless they are zero in all slices; returns its length."""
-    zero = splat_wide(0.0)
-    if bits_of(both(same(slope, zero), both(same(offset, zero), same(error, zero)))) == ALL_SLICES:
-        return count
-    K[COLS * M + count], K[ROWS * M + count], K[WEIGHTS * M + count] = c, r, c * rows
-    at = OUTPUTS * M + FORM * count
-    store(S, at, fma(slope, c0, zero))
-    store(S, at + 8, fma(slope, c1, zero))
-    store(S, at + 16, fma(slope, c2, zero))
-    store(S, at + 24, fma(slope, c3, offset))
-    store(S, at + 32, fma(magnitude(slope), growth, error))
-    return count + 1
+def settle_slices(F, N, X, S, J, K, M, tables, system, floats, s, at):
+    """Bound symbol ``s``, the form of whose row is at S[at], in each slice: its form and its pieces.
 
-
-@kernel
-def settle_slices(F, N, S, J, K, M, tables, row_unit, row_col, floats, rows, r, count, at):
-    """Bound a row, whose form is at S[at], in each slice, and relax its outputs; returns how many are listed."""
-    unit = N[row_unit + r]
+    An output so flat that all errors of its row are its own (`error_symbols`) has its chord over the row's centre, not
+    over the row.
+    """
+    rows = N[system + SYS_ROWS]
+    row_unit = system + SYS_HEADER + N[system + SYS_LEVELS] + 1
+    r = J[SYMBOL_ROW * M + s]
     c0, c1, c2 = load_wide(S, at), load_wide(S, at + 8), load_wide(S, at + 16)
-    c3, growth = load_wide(S, at + 24), load_wide(S, at + 32)
+    c3, radius = load_wide(S, at + 24), load_wide(S, at + 32)
     low, high = value_ranges(S, K, M, c0, c1, c2, c3)
-    reach = with_rounding(c0, c1, c2, c3, growth, tables.extent)
+    reach = with_rounding(c0, c1, c2, c3, radius, tables.extent)
     low, high = fma(splat_wide(-1.0), reach, low), fma(splat_wide(1.0), reach, high)
     first, last = J[STATE_LOW * M + r], J[STATE_HIGH * M + r]
     table = knots_of(floats, rows)
     if F[table + r] == F[table + r]:
-        slope, offset, error = relax_simple(F, K, M, table, rows, r, first, last, low, high)
-        c = N[row_col + r]
-        at = PIECES * M + POINT * c
-        store(S, at, slope)
-        store(S, at + 8, offset)
-        store(S, at + 16, error)
-        return list_output(S, K, M, rows, r, c, count, c0, c1, c2, c3, growth, slope, offset, error)
-    K[ABOVE * M + r] = K[UNDER * M + r] = 0
-    relax_tables(N, S, M, tables, row_col, r, unit, first, last, low, high)
-    for c in range(N[row_col + r], N[row_col + r + 1]):
-        at = PIECES * M + POINT * c
-        slope, offset, error = load_wide(S, at), load_wide(S, at + 8), load_wide(S, at + 16)
-        count = list_output(S, K, M, rows, r, c, count, c0, c1, c2, c3, growth, slope, offset, error)
-    return count
+        slope, offset, error = relax_simple(F, K, M, table, rows, r, s, first, last, low, high)
+    else:
+        K[ABOVE * M + s] = K[UNDER * M + s] = 0
+        output = J[READ_COLS * M + J[SYMBOL_OUTPUT * M + s]] - N[row_unit + rows + r]
+        slope, offset, error = relax_table(S, M, tables, N[row_unit + r], output, first, last, low, high)
+    zero, one = splat_wide(0.0), splat_wide(1.0)
+    most, chord = splat_wide(1.0 / X[SYMBOL_RADIUS * M + s]), X[SYMBOL_SLOPE * M + s]
+    offset = fma(most, fma(one, offset, splat_wide(-X[SYMBOL_OFFSET * M + s])), zero)
+    error = fma(most, error, zero)
+    onward, back = fma(one, slope, splat_wide(-chord)), zero
+    if abs(chord) < LEAST_SLOPE:
+        onward, back = slope, fma(most, splat_wide(-chord), zero)
+    onward = fma(most, onward, zero)
+    at = PIECES * M + PIECE * s
+    store(S, at, onward)
+    store(S, at + 8, offset)
+    store(S, at + 16, error)
+    at = SYMBOLS * M + FORM * s
+    store(S, at, fma(onward, c0, fma(back, splat_wide(X[r]), zero)))
+    store(S, at + 8, fma(onward, c1, fma(back, splat_wide(X[M + r]), zero)))
+    store(S, at + 16, fma(onward, c2, fma(back, splat_wide(X[2 * M + r]), zero)))
+    store(S, at + 24, fma(onward, c3, fma(back, splat_wide(X[3 * M + r]), offset)))
+    store(S, at + 32, fma(magnitude(onward), radius, error))
 
 
 @kernel
-def read_four(F, S, K, M, floats, rows, r, s, t, u, first, known):
-    """S[FORMS]: the affine forms and radii of four rows in each slice, from outputs ``first : known``."""
-    at = floats
-    a0, b0, c0, d0 = splat_wide(F[at + r]), splat_wide(F[at + s]), splat_wide(F[at + t]), splat_wide(F[at + u])
-    at += rows
-    a1, b1, c1, d1 = splat_wide(F[at + r]), splat_wide(F[at + s]), splat_wide(F[at + t]), splat_wide(F[at + u])
-    at += rows
-    a2, b2, c2, d2 = splat_wide(F[at + r]), splat_wide(F[at + s]), splat_wide(F[at + t]), splat_wide(F[at + u])
-    at += rows
-    a3, b3, c3, d3 = splat_wide(F[at + r]), splat_wide(F[at + s]), splat_wide(F[at + t]), splat_wide(F[at + u])
-    a4 = b4 = c4 = d4 = splat_wide(0.0)
-    weights = weights_of(floats, rows)
-    y = OUTPUTS * M + FORM * first
-    for p in range(first, known):
-        at = weights + K[WEIGHTS * M + p]
-        e, f, g, h = splat_wide(F[at + r]), splat_wide(F[at + s]), splat_wide(F[at + t]), splat_wide(F[at + u])
+def begin_form(X, M, r, share):
+    """The cell's own affine form of a row, and what rounding of its errors may have taken away."""
+    rounding = splat_wide(share * X[GROWTH * M + r] + TINY)
+    return splat_wide(X[r]), splat_wide(X[M + r]), splat_wide(X[2 * M + r]), splat_wide(X[3 * M + r]), rounding
+
+
+@kernel
+def read_four(E, X, S, J, M, errors, stride, s, last, known, share):
+    """S[FORMS]: the forms and radii in each slice of the rows of symbols ``s .. s + last``, four at most.
+
+    They read the symbols before ``known``. ``errors``, ``stride``: the cell's table; ``share``: its rounding.
+    """
+    t, u, v = s + min(1, last), s + min(2, last), s + last
+    a0, a1, a2, a3, a4 = begin_form(X, M, J[SYMBOL_ROW * M + s], share)
+    b0, b1, b2, b3, b4 = begin_form(X, M, J[SYMBOL_ROW * M + t], share)
+    c0, c1, c2, c3, c4 = begin_form(X, M, J[SYMBOL_ROW * M + u], share)
+    d0, d1, d2, d3, d4 = begin_form(X, M, J[SYMBOL_ROW * M + v], share)
+    if known == 0:  # affine, without rounding
+        a4 = b4 = c4 = d4 = splat_wide(0.0)
+    a, b = errors + J[SYMBOL_AT * M + s] * stride, errors + J[SYMBOL_AT * M + t] * stride
+    c, d = errors + J[SYMBOL_AT * M + u] * stride, errors + J[SYMBOL_AT * M + v] * stride
+    y = SYMBOLS * M
+    for p in range(known):
+        e, f = splat_wide(np.float64(E[a + p])), splat_wide(np.float64(E[b + p]))
+        g, h = splat_wide(np.float64(E[c + p])), splat_wide(np.float64(E[d + p]))
         y0, y1, y2 = load_wide(S, y), load_wide(S, y + 8), load_wide(S, y + 16)
         y3, y4 = load_wide(S, y + 24), load_wide(S, y + 32)
         a0, b0, c0, d0 = fma(e, y0, a0), fma(f, y0, b0), fma(g, y0, c0), fma(h, y0, d0)
@@ -185,112 +187,84 @@ def store_form(S, at, c0, c1, c2, c3, c4):
 
 
 @kernel
-def bound_rows(F, N, S, J, K, M, tables, system, floats):
-    """Bound all rows of the system in each slice; returns how many outputs are not zero in all of them."""
-    rows, cols, levels = N[system + SYS_ROWS], N[system + SYS_COLS], N[system + SYS_LEVELS]
-    level_start = system + SYS_HEADER
-    row_unit = level_start + levels + 1
-    row_col = row_unit + rows
-    col_end = row_col + rows + 1 + 2 * cols
-    first = count = np.int64(0)
-    real = REAL_ROWS * M
-    for level in range(levels):
-        begin, end = N[level_start + level], N[level_start + level + 1]
-        while first < count and N[col_end + K[COLS * M + first]] <= begin:
-            first += 1
-        found = 0
-        for r in range(begin, end):
-            K[real + found] = r
-            found += N[row_unit + r] >= 0
-        known = count
-        for q in range(0, found, 4):
-            last = found - 1 - q
-            at = real + q
-            r, s, t, u = K[at], K[at + min(1, last)], K[at + min(2, last)], K[at + min(3, last)]
-            read_four(F, S, K, M, floats, rows, r, s, t, u, first, known)
-            for k in range(min(4, found - q)):
-                count = settle_slices(
-                    F, N, S, J, K, M, tables, row_unit, row_col, floats, rows, K[at + k], count, FORMS * M + FORM * k
-                )
-    return count
+def bound_symbols(F, N, X, S, J, K, M, tables, system, floats, errors, stride):
+    """Bound all symbols of the cell in each slice: S[SYMBOLS], S[PIECES], K[ABOVE] and K[UNDER]."""
+    E = as_singles(F)
+    share = X[CENTRE_AT * M + ROUNDING_SHARE]
+    for level in range(N[system + SYS_LEVELS]):
+        begin, end = J[LEVEL_SYMBOL * M + level], J[LEVEL_SYMBOL * M + level + 1]
+        for s in range(begin, end, 4):
+            last = min(3, end - 1 - s)
+            read_four(E, X, S, J, M, errors, stride, s, last, begin, share)
+            for k in range(last + 1):
+                settle_slices(F, N, X, S, J, K, M, tables, system, floats, s + k, FORMS * M + FORM * k)
 
 
 @kernel
-def multiply_columns(F, S, M, weights, columns, begin, end):
-    """S[FORMS]: products of the derivatives of rows ``begin : end`` with four columns, given by where they begin."""
+def multiply_rows(E, S, J, M, errors, stride, s, begin, end):
+    """S[FORMS]: what the output reads of eight symbols from ``s`` on by way of the rows of symbols ``begin : end``."""
     a, b, c, d = splat_wide(0.0), splat_wide(0.0), splat_wide(0.0), splat_wide(0.0)
-    for r in range(begin, end):
-        m = load_wide(S, DERIVATIVES * M + SLICES * r)
-        at = weights + r
-        a = fma(splat_wide(F[at + columns[0]]), m, a)
-        b = fma(splat_wide(F[at + columns[1]]), m, b)
-        c = fma(splat_wide(F[at + columns[2]]), m, c)
-        d = fma(splat_wide(F[at + columns[3]]), m, d)
+    e, f, g, h = splat_wide(0.0), splat_wide(0.0), splat_wide(0.0), splat_wide(0.0)
+    for q in range(begin, end):
+        m = load_wide(S, PIECES * M + PIECE * q)
+        at = errors + J[SYMBOL_AT * M + q] * stride + s
+        a, b = fma(splat_wide(np.float64(E[at])), m, a), fma(splat_wide(np.float64(E[at + 1])), m, b)
+        c, d = fma(splat_wide(np.float64(E[at + 2])), m, c), fma(splat_wide(np.float64(E[at + 3])), m, d)
+        e, f = fma(splat_wide(np.float64(E[at + 4])), m, e), fma(splat_wide(np.float64(E[at + 5])), m, f)
+        g, h = fma(splat_wide(np.float64(E[at + 6])), m, g), fma(splat_wide(np.float64(E[at + 7])), m, h)
     at = FORMS * M
-    store(S, at, a)
-    store(S, at + 8, b)
-    store(S, at + 16, c)
-    store(S, at + 24, d)
+    store_form(S, at, a, b, c, d, e)
+    store(S, at + 40, f)
+    store(S, at + 48, g)
+    store(S, at + 56, h)
 
 
 @kernel
-def pass_back(F, S, K, M, p, out_weights, product, constant, radius):
-    """Go on from listed output ``p``, whose product is at S[product], to its row, the constant and the radius."""
-    column, row = PIECES * M + POINT * K[COLS * M + p], DERIVATIVES * M + SLICES * K[ROWS * M + p]
-    coefficients = fma(splat_wide(1.0), load_wide(S, product), splat_wide(F[out_weights + K[COLS * M + p]]))
-    store(S, row, fma(coefficients, load_wide(S, column), load_wide(S, row)))
-    constant = fma(coefficients, load_wide(S, column + 8), constant)
-    return constant, fma(magnitude(coefficients), load_wide(S, column + 16), radius)
+def bound_slice_outputs(F, N, X, S, J, K, M, extent, system, errors, stride, own):
+    """After `bound_symbols`, for every slice the range of the output's centre, and how far the output may be from that.
 
-
-@kernel
-def bound_output(F, N, S, K, M, extent, system, floats, count):
-    """After `bound_rows`, for every slice the range of the output's centre, and how far the output may be from that."""
-    rows, cols = N[system + SYS_ROWS], N[system + SYS_COLS]
-    col_begin = system + SYS_HEADER + N[system + SYS_LEVELS] + 1 + rows + rows + 1 + cols
-    col_end = col_begin + cols
-    weights = weights_of(floats, rows)
-    out_weights = weights + cols * rows
-    read = WEIGHTS * M
-    zero = splat_wide(0.0)
-    for r in range(rows):
-        store(S, DERIVATIVES * M + SLICES * r, zero)
-    constant = radius = zero
-    p = count
-    while p > 0:
-        # Up to four outputs of one level at a time; where there are fewer, the last one again.
-        begin = N[col_begin + K[COLS * M + p - 1]]
-        width = 1
-        while width < 4 and p > width and N[col_begin + K[COLS * M + p - 1 - width]] == begin:
-            width += 1
-        p -= width
-        end = N[col_end + K[COLS * M + p]]
-        last = width - 1
-        columns = K[read + p], K[read + p + min(1, last)], K[read + p + min(2, last)], K[read + p + last]
-        multiply_columns(F, S, M, weights, columns, begin, end)
-        for k in range(width):
-            constant, radius = pass_back(F, S, K, M, p + k, out_weights, FORMS * M + SLICES * k, constant, radius)
-    out = out_weights + padded(cols)
-    s0, s1, s2 = splat_wide(F[out]), splat_wide(F[out + 1]), splat_wide(F[out + 2])
-    s3 = fma(splat_wide(1.0), constant, splat_wide(F[out + 3]))
-    for r in range(rows):
-        m = load_wide(S, DERIVATIVES * M + SLICES * r)
-        s0 = fma(m, splat_wide(F[floats + r]), s0)
-        s1 = fma(m, splat_wide(F[floats + rows + r]), s1)
-        s2 = fma(m, splat_wide(F[floats + 2 * rows + r]), s2)
-        s3 = fma(m, splat_wide(F[floats + 3 * rows + r]), s3)
+    A backward pass over the slices' chords; ``own``: where the output's row of the table is.
+    """
+    E = as_singles(F)
+    zero, one = splat_wide(0.0), splat_wide(1.0)
+    share = X[CENTRE_AT * M + ROUNDING_SHARE]
+    levels = N[system + SYS_LEVELS]
+    total = J[LEVEL_SYMBOL * M + levels]
+    at = CENTRE_AT * M
+    s0, s1, s2, s3 = splat_wide(X[at]), splat_wide(X[at + 1]), splat_wide(X[at + 2]), splat_wide(X[at + 3])
+    radius = splat_wide(X[at + OUTPUT_ROUNDING])
+    for level in range(levels - 1, -1, -1):
+        begin, end = J[LEVEL_SYMBOL * M + level], J[LEVEL_SYMBOL * M + level + 1]
+        rounding = 0.0 if begin == 0 else 1.0
+        for first in range(begin, end, 8):
+            multiply_rows(E, S, J, M, errors, stride, first, end, total)
+            for s in range(first, min(first + 8, end)):
+                r, piece = J[SYMBOL_ROW * M + s], PIECES * M + PIECE * s
+                read = load_wide(S, FORMS * M + SLICES * (s - first))
+                read = fma(one, read, splat_wide(np.float64(E[own + s])))
+                onward = fma(read, load_wide(S, piece), zero)
+                store(S, piece, onward)
+                s3 = fma(read, load_wide(S, piece + 8), s3)
+                radius = fma(magnitude(read), load_wide(S, piece + 16), radius)
+                lost = splat_wide(rounding * (share * X[GROWTH * M + r] + TINY))
+                radius = fma(magnitude(onward), lost, radius)
+                chord = X[SYMBOL_SLOPE * M + s]
+                if abs(chord) < LEAST_SLOPE:
+                    onward = fma(read, splat_wide(-chord / X[SYMBOL_RADIUS * M + s]), onward)
+                s0, s1 = fma(onward, splat_wide(X[r]), s0), fma(onward, splat_wide(X[M + r]), s1)
+                s2, s3 = fma(onward, splat_wide(X[2 * M + r]), s2), fma(onward, splat_wide(X[3 * M + r]), s3)
     low, high = value_ranges(S, K, M, s0, s1, s2, s3)
     return low, high, with_rounding(s0, s1, s2, s3, radius, extent)
 
 
 @kernel
-def missed_slices(F, N, S, J, K, M, tables, system, floats):
+def missed_slices(F, N, X, S, J, K, M, tables, system, floats, errors, stride, own):
     """The slices that the surface provably misses, as bits, after `place_points`.
 
     The states of the system's rows over the cell are in J. Sets K[ABOVE] and K[UNDER].
     """
-    count = bound_rows(F, N, S, J, K, M, tables, system, floats)
-    low, high, slack = bound_output(F, N, S, K, M, tables.extent, system, floats, count)
+    bound_symbols(F, N, X, S, J, K, M, tables, system, floats, errors, stride)
+    low, high, slack = bound_slice_outputs(F, N, X, S, J, K, M, tables.extent, system, errors, stride, own)
     below_zero = is_below(high, fma(splat_wide(-1.0), slack, splat_wide(0.0)))
     return bits_of(either(is_below(slack, low), below_zero))
 
@@ -301,16 +275,15 @@ def keep_states(N, J, K, M, system, slices):
 
     That is constructive disjunction (Trombettoni and Chabert, Constructive Interval Disjunction, CP 2007).
     """
-    row_unit = system + SYS_HEADER + N[system + SYS_LEVELS] + 1
     settled = 0
-    for r in range(N[system + SYS_ROWS]):
-        first, last = J[STATE_LOW * M + r], J[STATE_HIGH * M + r]
-        if first == last or N[row_unit + r] < 0:
+    for s in range(J[LEVEL_SYMBOL * M + N[system + SYS_LEVELS]]):
+        r = J[SYMBOL_ROW * M + s]
+        if J[STATE_LOW * M + r] == J[STATE_HIGH * M + r]:
             continue
-        if K[ABOVE * M + r] & slices == slices:
+        if K[ABOVE * M + s] & slices == slices:
             J[STATE_LOW * M + r] = 1
             settled += 1
-        elif K[UNDER * M + r] & slices == slices:
+        elif K[UNDER * M + s] & slices == slices:
             J[STATE_HIGH * M + r] = 0
             settled += 1
     return settled

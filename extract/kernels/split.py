@@ -25,6 +25,7 @@ from mn_onnx.extract.kernels.memory import (
     CELL_END_I,
     CELL_FLOATS,
     CELL_HEADER,
+    CELL_SINCE,
     CELL_SYSTEM_F,
     CELL_SYSTEM_I,
     CENTRE_AT,
@@ -100,14 +101,14 @@ def choose_split(N, X, J, M, tables, system):
 
 
 @kernel
-def push_cell(N, J, M, control, stack, part, vertices, depth, system, floats, row, low, high):
+def push_cell(N, J, M, control, stack, part, vertices, depth, since, system, floats, row, low, high):
     """Finish a cell whose polytope has been written at ``part``, and push it.
 
     Its states over ``system`` are those in J, except that ``row`` has ``low..high``.
     """
     rows = N[system + SYS_ROWS]
     N[part + CELL_SYSTEM_F], N[part + CELL_SYSTEM_I] = floats, system
-    N[part + CELL_DEPTH] = depth
+    N[part + CELL_DEPTH], N[part + CELL_SINCE] = depth, since
     states = part + CELL_HEADER
     for r in range(rows):
         N[states + r] = J[STATE_LOW * M + r]
@@ -136,7 +137,7 @@ def split_cell(F, N, X, J, M, control, stack, tables, slot_of_tag, cell, cell_ro
     if not link_cut_edges(J, M, slot_of_tag, count):
         control[BROKEN_CUTS] += 1
         return
-    rows, depth = N[system + SYS_ROWS], N[cell + CELL_DEPTH] + 1
+    rows, depth, since = N[system + SYS_ROWS], N[cell + CELL_DEPTH] + 1, N[cell + CELL_SINCE] + 1
     for side in (1, 0):
         # The plane may miss the cell by rounding: a knot is compared otherwise here than where it was chosen.
         if J[SIDE_COUNTS * M + side] == 0:
@@ -145,7 +146,7 @@ def split_cell(F, N, X, J, M, control, stack, tables, slot_of_tag, cell, cell_ro
         vertices = write_half(F, N, X, J, M, cell, cell_rows, rows, count, side, 2 * plane + side, part, control[TOP_F])
         low = knot + 1 if side == 1 else J[STATE_LOW * M + row]
         high = knot if side == 0 else J[STATE_HIGH * M + row]
-        push_cell(N, J, M, control, stack, part, vertices, depth, system, floats, row, low, high)
+        push_cell(N, J, M, control, stack, part, vertices, depth, since, system, floats, row, low, high)
 
 
 @kernel
@@ -156,7 +157,7 @@ def write_part(F, N, X, J, M, control, cell, rows, part_rows, count, side, tag):
     """
     part = control[TOP_I]
     vertices = write_half(F, N, X, J, M, cell, rows, part_rows, count, side, tag, part, control[TOP_F])
-    N[part + CELL_DEPTH] = N[cell + CELL_DEPTH]
+    N[part + CELL_DEPTH], N[part + CELL_SINCE] = N[cell + CELL_DEPTH], N[cell + CELL_SINCE]
     control[TOP_F] += 3 * N[part + CELL_CAPACITY]
     control[TOP_I] += cell_ints(part_rows, vertices)
     return part
@@ -201,10 +202,10 @@ def trim_cell(F, N, X, J, M, control, tables, slot_of_tag, cell, rows, low, high
 
 
 @kernel
-def push_trimmed(F, N, J, M, control, stack, cell, cell_rows, system, floats):
-    """Push a trimmed cell as it is, with the folded ``system``: none of the affine rows has a knot in it any more."""
+def push_trimmed(F, N, J, M, control, stack, cell, cell_rows, system, floats, since):
+    """Push a trimmed cell as it is, with the folded ``system``, and CELL_SINCE as given."""
     part, at = control[TOP_I], control[TOP_F]
     vertices = copy_polytope(F, N, cell, cell_rows, N[system + SYS_ROWS], part, at)
     depth = N[cell + CELL_DEPTH] + 1
     low, high = J[STATE_LOW * M], J[STATE_HIGH * M]
-    push_cell(N, J, M, control, stack, part, vertices, depth, system, floats, np.int64(0), low, high)
+    push_cell(N, J, M, control, stack, part, vertices, depth, since, system, floats, np.int64(0), low, high)
