@@ -136,6 +136,16 @@ def round_to_singles(typing_context: Any, values: Any) -> Any:
 
 
 @intrinsic
+def as_doubles(typing_context: Any, values: Any) -> Any:
+    """Eight float32 as float64."""
+
+    def code(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        return builder.fpext(arguments[0], wide_lanes.vector)
+
+    return wide_lanes(wide_singles), code
+
+
+@intrinsic
 def load(typing_context: Any, source: Any, index: Any) -> Any:
     """``source[index : index + WIDTH]`` through a pointer."""
     return lanes(source, types.int64), load_plain

@@ -21,12 +21,13 @@ from mn_onnx.ir.kernel import kernel
 
 SLICES, ALL_SLICES = 8, 0xFF  # one to a lane; as bits
 
-# Regions of the scratch S, in multiples of M. For every symbol the five vectors of its affine form and radius; then
-# slope, offset and error of its chord, of which the slope becomes the output's derivative by the symbol's row; the
-# lists of points; of every vertex how far it is above each plane; the forms of four rows, or eight products; the chords
-# of one unit.
-SYMBOLS, PIECES, POINTS, PLANE_VALUES, FORMS, RELAXED = 0, 40, 64, 104, 112, 113
-SLICE_FLOATS = 114
+# Regions of the scratch S, in multiples of M. For every symbol, in float32, the five vectors of its affine form and
+# radius, and the output's derivative by its row; slope, offset and error of its chord; the lists of points; of every
+# vertex how far it is above each plane; the forms of four rows, or eight products; the chords of one unit; the middle
+# of the cell and half of its extent along each axis, and the largest that any symbol can be by its form.
+SYMBOLS, DERIVATIVES, PIECES, POINTS, PLANE_VALUES, FORMS, RELAXED, MIDDLE = 0, 20, 24, 48, 88, 96, 97, 98
+MOST = 8  # after S[MIDDLE]
+SLICE_FLOATS = 99
 # Regions of the scratch K: of every symbol the slices in which its unit is settled, as bits; the slice of every vertex;
 # the numbers of points.
 ABOVE, UNDER, SLICE_OF, POINT_COUNTS = 0, 1, 2, 3
@@ -62,11 +63,24 @@ def find_slices(F, N, X, S, K, M, cell, low, thickness):
 
 
 @kernel
+def find_middle(F, N, S, M, cell):
+    """S[MIDDLE]: the middle of the cell's bounding box (three numbers), and half of its size."""
+    n, capacity = N[cell + CELL_VERTICES], N[cell + CELL_CAPACITY]
+    for axis in range(3):
+        x = N[cell + CELL_FLOATS] + axis * capacity
+        low = high = F[x]
+        for v in range(1, n):
+            low, high = min(low, F[x + v]), max(high, F[x + v])
+        S[MIDDLE * M + axis] = 0.5 * low + 0.5 * high
+        S[MIDDLE * M + 3 + axis] = 0.5 * high - 0.5 * low
+
+
+@kernel
 def place_points(F, N, X, S, K, M, cell, rows, low, thickness):
     """The vertices of all slices: lane ``k`` of S[POINTS] lists those of slice ``k``.
 
-    The lists are equally long, the first of K[POINT_COUNTS], by copies of a point. ``low``: the least value of the
-    centre, X[CENTRE_AT], on the cell. Returns whether all slices have points, and there is room for them.
+    The lists are equally long, the first of K[POINT_COUNTS], by copies of a point. Also S[MIDDLE]. ``low``: the least
+    value of the centre, X[CENTRE_AT], on the cell. Returns whether all slices have points, and there is room for them.
     """
     n, x, capacity = N[cell + CELL_VERTICES], N[cell + CELL_FLOATS], N[cell + CELL_CAPACITY]
     neighbours = cell + CELL_HEADER + 2 * rows + 3 * n
@@ -75,6 +89,7 @@ def place_points(F, N, X, S, K, M, cell, rows, low, thickness):
     if 4 * n * POINT > (PLANE_VALUES - POINTS) * M:
         return False
     find_slices(F, N, X, S, K, M, cell, low, thickness)
+    find_middle(F, N, S, M, cell)
     for k in range(SLICES):
         K[counts + k] = 0
     for v in range(n):

@@ -9,20 +9,36 @@ symbols, and a symbol is how far a unit's output is from the unit's chord, in un
 In a slice, units have shorter chords, y = s' t + o' within m', so that e_j is affine in t_j with slope (s' - s) / m and
 error m' / m. Unlike in bounds from weights, a radius does not pass through s', but only through what is new in it, so
 that these bounds are nearly as tight as errors tracked anew, and cost the square of the number of undecided units.
+
+Symbols are summed in float32, as forms around the cell's middle, where none is much larger than one; what rounding may
+take away of a row is then at most half a unit in the last place of the row's radius for every symbol, and a little.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-from mn_onnx.extract.kernels.error_symbols import LEAST_SLOPE, TINY
-from mn_onnx.extract.kernels.lanes import as_singles, fma, load_wide, magnitude, splat_wide, store
+from mn_onnx.extract.kernels.error_symbols import LEAST_SLOPE, ROUNDING, TINY
+from mn_onnx.extract.kernels.lanes import (
+    as_doubles,
+    as_singles,
+    fma,
+    larger,
+    load_eight,
+    load_wide,
+    magnitude,
+    round_to_singles,
+    splat_eight,
+    splat_wide,
+    store,
+)
 from mn_onnx.extract.kernels.masks import at_least, bits_of, either, is_below, mask_of
 from mn_onnx.extract.kernels.memory import (
     CENTRE_AT,
     GROWTH,
     LEVEL_SYMBOL,
     OUTPUT_ROUNDING,
+    RADIUS,
     READ_COLS,
     ROUNDING_SHARE,
     STATE_HIGH,
@@ -42,8 +58,11 @@ from mn_onnx.extract.kernels.relax import narrow_states, relax_one_knot, relax_p
 from mn_onnx.extract.kernels.slice_points import (
     ABOVE,
     ALL_SLICES,
+    DERIVATIVES,
     FORM,
     FORMS,
+    MIDDLE,
+    MOST,
     PIECE,
     PIECES,
     RELAXED,
@@ -94,7 +113,7 @@ def relax_table(S, M, tables, unit, output, first, last, low, high):
 
 @kernel
 def settle_slices(F, N, X, S, J, K, M, tables, system, floats, s, at):
-    """Bound symbol ``s``, the form of whose row is at S[at], in each slice: its form and its pieces.
+    """Bound symbol ``s``, the form of whose row is at S[at], in each slice: its form and its chord.
 
     An output so flat that all errors of its row are its own (`error_symbols`) has its chord over the row's centre, not
     over the row.
@@ -127,19 +146,52 @@ def settle_slices(F, N, X, S, J, K, M, tables, system, floats, s, at):
     store(S, at, onward)
     store(S, at + 8, offset)
     store(S, at + 16, error)
-    at = SYMBOLS * M + FORM * s
-    store(S, at, fma(onward, c0, fma(back, splat_wide(X[r]), zero)))
-    store(S, at + 8, fma(onward, c1, fma(back, splat_wide(X[M + r]), zero)))
-    store(S, at + 16, fma(onward, c2, fma(back, splat_wide(X[2 * M + r]), zero)))
-    store(S, at + 24, fma(onward, c3, fma(back, splat_wide(X[3 * M + r]), offset)))
-    store(S, at + 32, fma(magnitude(onward), radius, error))
+    c0 = fma(onward, c0, fma(back, splat_wide(X[r]), zero))
+    c1 = fma(onward, c1, fma(back, splat_wide(X[M + r]), zero))
+    c2 = fma(onward, c2, fma(back, splat_wide(X[2 * M + r]), zero))
+    c3 = fma(onward, c3, fma(back, splat_wide(X[3 * M + r]), offset))
+    store_symbol(S, M, s, c0, c1, c2, c3, fma(magnitude(onward), radius, error))
 
 
 @kernel
-def begin_form(X, M, r, share):
-    """The cell's own affine form of a row, and what rounding of its errors may have taken away."""
-    rounding = splat_wide(share * X[GROWTH * M + r] + TINY)
-    return splat_wide(X[r]), splat_wide(X[M + r]), splat_wide(X[2 * M + r]), splat_wide(X[3 * M + r]), rounding
+def store_symbol(S, M, s, c0, c1, c2, c3, radius):
+    """Write a symbol's form and radius, around the cell's middle, to S[SYMBOLS], and enlarge S[MOST] if need be."""
+    T, one = as_singles(S), splat_wide(1.0)
+    middle = MIDDLE * M
+    x, y, z = splat_wide(S[middle]), splat_wide(S[middle + 1]), splat_wide(S[middle + 2])
+    value = fma(c0, x, fma(c1, y, fma(c2, z, c3)))
+    at = 2 * SYMBOLS * M + FORM * s
+    store(T, at, round_to_singles(c0))
+    store(T, at + 8, round_to_singles(c1))
+    store(T, at + 16, round_to_singles(c2))
+    store(T, at + 24, round_to_singles(value))
+    store(T, at + 32, round_to_singles(radius))
+    x, y, z = splat_wide(S[middle + 3]), splat_wide(S[middle + 4]), splat_wide(S[middle + 5])
+    most = fma(one, magnitude(value), radius)
+    most = fma(magnitude(c0), x, fma(magnitude(c1), y, fma(magnitude(c2), z, most)))
+    store(S, middle + MOST, larger(most, load_wide(S, middle + MOST)))
+
+
+@kernel
+def finish_form(X, S, M, r, known, share, at, c0, c1, c2, c3, radius):
+    """S[at]: a row's form and radius, its own centre and what it reads of ``known`` symbols, given in float32.
+
+    ``share``: the rounding of the cell's table.
+    """
+    one, minus, middle = splat_wide(1.0), splat_wide(-1.0), MIDDLE * M
+    d0, d1, d2, d3 = as_doubles(c0), as_doubles(c1), as_doubles(c2), as_doubles(c3)
+    store(S, at, fma(one, d0, splat_wide(X[r])))
+    store(S, at + 8, fma(one, d1, splat_wide(X[M + r])))
+    store(S, at + 16, fma(one, d2, splat_wide(X[2 * M + r])))
+    at_middle = fma(d0, splat_wide(S[middle]), fma(d1, splat_wide(S[middle + 1]), splat_wide(0.0)))
+    at_middle = fma(d2, splat_wide(S[middle + 2]), at_middle)
+    store(S, at + 24, fma(minus, at_middle, fma(one, d3, splat_wide(X[3 * M + r]))))
+    if known == 0:  # affine, without rounding
+        store(S, at + 32, splat_wide(0.0))
+        return
+    lost = splat_wide(ROUNDING * (known + 8) * X[RADIUS * M + r])
+    lost = fma(lost, load_wide(S, middle + MOST), splat_wide(share * X[GROWTH * M + r] + TINY))
+    store(S, at + 32, fma(one, as_doubles(radius), lost))
 
 
 @kernel
@@ -148,21 +200,17 @@ def read_four(E, X, S, J, M, errors, stride, s, last, known, share):
 
     They read the symbols before ``known``. ``errors``, ``stride``: the cell's table; ``share``: its rounding.
     """
+    T = as_singles(S)
     t, u, v = s + min(1, last), s + min(2, last), s + last
-    a0, a1, a2, a3, a4 = begin_form(X, M, J[SYMBOL_ROW * M + s], share)
-    b0, b1, b2, b3, b4 = begin_form(X, M, J[SYMBOL_ROW * M + t], share)
-    c0, c1, c2, c3, c4 = begin_form(X, M, J[SYMBOL_ROW * M + u], share)
-    d0, d1, d2, d3, d4 = begin_form(X, M, J[SYMBOL_ROW * M + v], share)
-    if known == 0:  # affine, without rounding
-        a4 = b4 = c4 = d4 = splat_wide(0.0)
+    a0 = a1 = a2 = a3 = a4 = b0 = b1 = b2 = b3 = b4 = splat_eight(np.float32(0.0))
+    c0 = c1 = c2 = c3 = c4 = d0 = d1 = d2 = d3 = d4 = a0
     a, b = errors + J[SYMBOL_AT * M + s] * stride, errors + J[SYMBOL_AT * M + t] * stride
     c, d = errors + J[SYMBOL_AT * M + u] * stride, errors + J[SYMBOL_AT * M + v] * stride
-    y = SYMBOLS * M
+    y = 2 * SYMBOLS * M
     for p in range(known):
-        e, f = splat_wide(np.float64(E[a + p])), splat_wide(np.float64(E[b + p]))
-        g, h = splat_wide(np.float64(E[c + p])), splat_wide(np.float64(E[d + p]))
-        y0, y1, y2 = load_wide(S, y), load_wide(S, y + 8), load_wide(S, y + 16)
-        y3, y4 = load_wide(S, y + 24), load_wide(S, y + 32)
+        e, f, g, h = splat_eight(E[a + p]), splat_eight(E[b + p]), splat_eight(E[c + p]), splat_eight(E[d + p])
+        y0, y1, y2 = load_eight(T, y), load_eight(T, y + 8), load_eight(T, y + 16)
+        y3, y4 = load_eight(T, y + 24), load_eight(T, y + 32)
         a0, b0, c0, d0 = fma(e, y0, a0), fma(f, y0, b0), fma(g, y0, c0), fma(h, y0, d0)
         a1, b1, c1, d1 = fma(e, y1, a1), fma(f, y1, b1), fma(g, y1, c1), fma(h, y1, d1)
         a2, b2, c2, d2 = fma(e, y2, a2), fma(f, y2, b2), fma(g, y2, c2), fma(h, y2, d2)
@@ -170,20 +218,11 @@ def read_four(E, X, S, J, M, errors, stride, s, last, known, share):
         a4, b4 = fma(magnitude(e), y4, a4), fma(magnitude(f), y4, b4)
         c4, d4 = fma(magnitude(g), y4, c4), fma(magnitude(h), y4, d4)
         y += FORM
-    store_form(S, FORMS * M, a0, a1, a2, a3, a4)
-    store_form(S, FORMS * M + FORM, b0, b1, b2, b3, b4)
-    store_form(S, FORMS * M + 2 * FORM, c0, c1, c2, c3, c4)
-    store_form(S, FORMS * M + 3 * FORM, d0, d1, d2, d3, d4)
-
-
-@kernel
-def store_form(S, at, c0, c1, c2, c3, c4):
-    """Write five vectors."""
-    store(S, at, c0)
-    store(S, at + 8, c1)
-    store(S, at + 16, c2)
-    store(S, at + 24, c3)
-    store(S, at + 32, c4)
+    at, rows = FORMS * M, SYMBOL_ROW * M
+    finish_form(X, S, M, J[rows + s], known, share, at, a0, a1, a2, a3, a4)
+    finish_form(X, S, M, J[rows + t], known, share, at + FORM, b0, b1, b2, b3, b4)
+    finish_form(X, S, M, J[rows + u], known, share, at + 2 * FORM, c0, c1, c2, c3, c4)
+    finish_form(X, S, M, J[rows + v], known, share, at + 3 * FORM, d0, d1, d2, d3, d4)
 
 
 @kernel
@@ -191,6 +230,7 @@ def bound_symbols(F, N, X, S, J, K, M, tables, system, floats, errors, stride):
     """Bound all symbols of the cell in each slice: S[SYMBOLS], S[PIECES], K[ABOVE] and K[UNDER]."""
     E = as_singles(F)
     share = X[CENTRE_AT * M + ROUNDING_SHARE]
+    store(S, MIDDLE * M + MOST, splat_wide(1.0))
     for level in range(N[system + SYS_LEVELS]):
         begin, end = J[LEVEL_SYMBOL * M + level], J[LEVEL_SYMBOL * M + level + 1]
         for s in range(begin, end, 4):
@@ -203,39 +243,45 @@ def bound_symbols(F, N, X, S, J, K, M, tables, system, floats, errors, stride):
 @kernel
 def multiply_rows(E, S, J, M, errors, stride, s, begin, end):
     """S[FORMS]: what the output reads of eight symbols from ``s`` on by way of the rows of symbols ``begin : end``."""
-    a, b, c, d = splat_wide(0.0), splat_wide(0.0), splat_wide(0.0), splat_wide(0.0)
-    e, f, g, h = splat_wide(0.0), splat_wide(0.0), splat_wide(0.0), splat_wide(0.0)
+    T = as_singles(S)
+    a = b = c = d = e = f = g = h = splat_eight(np.float32(0.0))
     for q in range(begin, end):
-        m = load_wide(S, PIECES * M + PIECE * q)
+        m = load_eight(T, 2 * DERIVATIVES * M + SLICES * q)
         at = errors + J[SYMBOL_AT * M + q] * stride + s
-        a, b = fma(splat_wide(np.float64(E[at])), m, a), fma(splat_wide(np.float64(E[at + 1])), m, b)
-        c, d = fma(splat_wide(np.float64(E[at + 2])), m, c), fma(splat_wide(np.float64(E[at + 3])), m, d)
-        e, f = fma(splat_wide(np.float64(E[at + 4])), m, e), fma(splat_wide(np.float64(E[at + 5])), m, f)
-        g, h = fma(splat_wide(np.float64(E[at + 6])), m, g), fma(splat_wide(np.float64(E[at + 7])), m, h)
+        a, b = fma(splat_eight(E[at]), m, a), fma(splat_eight(E[at + 1]), m, b)
+        c, d = fma(splat_eight(E[at + 2]), m, c), fma(splat_eight(E[at + 3]), m, d)
+        e, f = fma(splat_eight(E[at + 4]), m, e), fma(splat_eight(E[at + 5]), m, f)
+        g, h = fma(splat_eight(E[at + 6]), m, g), fma(splat_eight(E[at + 7]), m, h)
     at = FORMS * M
-    store_form(S, at, a, b, c, d, e)
-    store(S, at + 40, f)
-    store(S, at + 48, g)
-    store(S, at + 56, h)
+    store(S, at, as_doubles(a))
+    store(S, at + 8, as_doubles(b))
+    store(S, at + 16, as_doubles(c))
+    store(S, at + 24, as_doubles(d))
+    store(S, at + 32, as_doubles(e))
+    store(S, at + 40, as_doubles(f))
+    store(S, at + 48, as_doubles(g))
+    store(S, at + 56, as_doubles(h))
 
 
 @kernel
 def bound_slice_outputs(F, N, X, S, J, K, M, extent, system, errors, stride, own):
     """After `bound_symbols`, for every slice the range of the output's centre, and how far the output may be from that.
 
-    A backward pass over the slices' chords; ``own``: where the output's row of the table is.
+    A backward pass over the slices' chords; ``own``: where the output's row of the table is. No symbol is larger than
+    one, so that what rounding takes off their coefficients adds up to no more than it can be off radii.
     """
-    E = as_singles(F)
+    E, T = as_singles(F), as_singles(S)
     zero, one = splat_wide(0.0), splat_wide(1.0)
     share = X[CENTRE_AT * M + ROUNDING_SHARE]
     levels = N[system + SYS_LEVELS]
     total = J[LEVEL_SYMBOL * M + levels]
+    unit_roundoff = ROUNDING * (total + 8)
     at = CENTRE_AT * M
     s0, s1, s2, s3 = splat_wide(X[at]), splat_wide(X[at + 1]), splat_wide(X[at + 2]), splat_wide(X[at + 3])
     radius = splat_wide(X[at + OUTPUT_ROUNDING])
     for level in range(levels - 1, -1, -1):
         begin, end = J[LEVEL_SYMBOL * M + level], J[LEVEL_SYMBOL * M + level + 1]
-        rounding = 0.0 if begin == 0 else 1.0
+        rounded = 0.0 if begin == 0 else 1.0
         for first in range(begin, end, 8):
             multiply_rows(E, S, J, M, errors, stride, first, end, total)
             for s in range(first, min(first + 8, end)):
@@ -243,11 +289,11 @@ def bound_slice_outputs(F, N, X, S, J, K, M, extent, system, errors, stride, own
                 read = load_wide(S, FORMS * M + SLICES * (s - first))
                 read = fma(one, read, splat_wide(np.float64(E[own + s])))
                 onward = fma(read, load_wide(S, piece), zero)
-                store(S, piece, onward)
+                store(T, 2 * DERIVATIVES * M + SLICES * s, round_to_singles(onward))
                 s3 = fma(read, load_wide(S, piece + 8), s3)
                 radius = fma(magnitude(read), load_wide(S, piece + 16), radius)
-                lost = splat_wide(rounding * (share * X[GROWTH * M + r] + TINY))
-                radius = fma(magnitude(onward), lost, radius)
+                lost = rounded * (share * X[GROWTH * M + r] + TINY) + unit_roundoff * X[RADIUS * M + r]
+                radius = fma(magnitude(onward), splat_wide(lost), radius)
                 chord = X[SYMBOL_SLOPE * M + s]
                 if abs(chord) < LEAST_SLOPE:
                     onward = fma(read, splat_wide(-chord / X[SYMBOL_RADIUS * M + s]), onward)
