@@ -88,16 +88,18 @@ PANEL = 192
 
 
 @kernel
-def add_tile(E, J, target, stride, table, read, count, weights, room):
-    """Add 16 symbols of what eight rows read of ``count`` rows before them to E[target].
+def add_tile(E, J, target, stride, table, read, count, weights, room, first):
+    """Add 16 symbols of what eight rows read of ``count`` rows before them to E[target], or write them if ``first``.
 
     ``table``: the first symbol's entry of row 0; ``read``: J's index of the rows read; ``weights``: eight for each,
     ``room`` apart.
     """
     t1, t2, t3 = target + stride, target + 2 * stride, target + 3 * stride
     t4, t5, t6, t7 = target + 4 * stride, t1 + 4 * stride, t2 + 4 * stride, t3 + 4 * stride
-    a0, a1, a2, a3 = load_singles(E, target), load_singles(E, t1), load_singles(E, t2), load_singles(E, t3)
-    a4, a5, a6, a7 = load_singles(E, t4), load_singles(E, t5), load_singles(E, t6), load_singles(E, t7)
+    a0 = a1 = a2 = a3 = a4 = a5 = a6 = a7 = splat_singles(np.float32(0.0))
+    if not first:
+        a0, a1, a2, a3 = load_singles(E, target), load_singles(E, t1), load_singles(E, t2), load_singles(E, t3)
+        a4, a5, a6, a7 = load_singles(E, t4), load_singles(E, t5), load_singles(E, t6), load_singles(E, t7)
     for p in range(count):
         u = load_singles(E, table + J[read + p] * stride)
         a0 = fma(splat_singles(E[weights]), u, a0)
@@ -148,14 +150,15 @@ def gather_weights(F, E, X, J, M, weights, begin, end, live, first, count, read,
 
 @kernel
 def begin_rows(E, X, J, M, live, known, symbols, errors, stride, read, room):
-    """So many rows of the table from E[errors] on: what they read of the own errors ``known:symbols``, else zero.
+    """What so many rows of the table from E[errors] on read of the own errors ``known:symbols``.
 
-    ``read``: what `gather_weights` has written, from output 0 on.
+    Zeros fill the tiles in which these begin and end; those before are left to `add_tile`. ``read``: what
+    `gather_weights` has written, from output 0 on.
     """
     nothing = splat_singles(np.float32(0.0))
     for row in range(errors, errors + live * stride, stride):
-        for q in range(0, known, 16):
-            store(E, row + q, nothing)
+        store(E, row + (known & ~15), nothing)
+        store(E, row + (symbols & ~15), nothing)
     for s in range(known, symbols, 4):
         at, own = SYMBOL_OUTPUT * M + s, SYMBOL_ERROR * M + s
         a, b = read + J[at] * room, read + J[at + 1] * room
@@ -174,9 +177,6 @@ def begin_rows(E, X, J, M, live, known, symbols, errors, stride, read, room):
                 times(load_eight(E, d + r), h),
             )
             target += 8 * stride
-    for row in range(errors, errors + live * stride, stride):
-        for q in range(symbols, (symbols + 15) & ~15, 16):
-            store(E, row + q, nothing)
 
 
 @kernel
@@ -212,12 +212,15 @@ def track_errors(F, X, J, M, weights, begin, end, live, level, first, count, err
         while J[LEVEL_SYMBOL * M + earlier + 1] <= q:
             earlier += 1
         p = max(first, J[LEVEL_OUTPUT * M + earlier + 1])
-        while p < count:
+        is_first = q + 16 <= known
+        while p < count or is_first:
             n = min(PANEL, count - p)
             for r in range(0, live, 8):
                 at = read + (p - first) * room + r
-                add_tile(E, J, own_rows + r * stride + q, stride, errors + q, READ_ROW * M + p, n, at, room)
+                target = own_rows + r * stride + q
+                add_tile(E, J, target, stride, errors + q, READ_ROW * M + p, n, at, room, is_first)
             p += PANEL
+            is_first = False
     rounding += ROUNDING * (outputs + (symbols >> 4) + 16)
     for r in range(live):
         row = J[LIVE_ROWS * M + r]
